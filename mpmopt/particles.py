@@ -1,0 +1,62 @@
+"""The scene's body laid out as particles."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpmopt.scene import Actuator, Design, Scene
+
+
+@dataclass(frozen=True)
+class Particles:
+    """N particles in their reference position.
+
+    Attributes
+    ----------
+    position : (N, 2) array
+    volume : (N,) array
+        Reference volume (an area).
+    designed : (N,) array of bool
+        Whether a particle's material is designed; the others are solid.
+    actuator : (N,) array of int
+        Index of the particle's actuator, -1 if it has none.
+    """
+
+    position: NDArray[np.float64]
+    volume: NDArray[np.float64]
+    designed: NDArray[np.bool_]
+    actuator: NDArray[np.int64]
+
+    def subset(self, keep: NDArray[np.bool_]) -> Particles:
+        """The particles that `keep` (N,) marks, in the same order."""
+        return Particles(
+            self.position[keep], self.volume[keep], self.designed[keep], self.actuator[keep]
+        )
+
+
+def lay_out(scene: Scene) -> Particles:
+    """Fill the body with a regular lattice of particles, column by column as nodes are stored."""
+    spacing = scene.grid.dx / scene.particles_per_cell
+    columns, rows, designed, actuator = [], [], [], []
+    actuators = 0
+    for region in scene.body:
+        i0, j0 = (round(edge / spacing) for edge in region.lower)
+        i1, j1 = (round(edge / spacing) for edge in region.upper)
+        i, j = (index.ravel() for index in np.meshgrid(range(i0, i1), range(j0, j1)))
+        columns.append(i)
+        rows.append(j)
+        designed.append(np.full(i.size, isinstance(region, Design)))
+        actuator.append(np.full(i.size, actuators if isinstance(region, Actuator) else -1))
+        actuators += isinstance(region, Actuator)
+    i, j = np.concatenate(columns), np.concatenate(rows)
+    order = np.lexsort((j, i))
+    position = (np.stack([i, j], axis=1)[order] + 0.5) * spacing
+    return Particles(
+        position=position,
+        volume=np.full(len(position), spacing**2),
+        designed=np.concatenate(designed)[order],
+        actuator=np.concatenate(actuator)[order].astype(np.int64),
+    )

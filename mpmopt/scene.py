@@ -1,0 +1,506 @@
+"""What is simulated: grid, time, material, body and walls, checked on construction."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+
+from mpmopt.errors import SceneError
+
+Vector = tuple[float, float]
+
+# s = a sin(...) + b with a and b within [-1, 1]
+LARGEST_SIGNAL = 2.0
+# Edges may miss a lattice line by rounding, in units of its spacing.
+ROUNDING = 1e-6
+
+
+def _number(owner: str, name: str, value: Any, *, above: float = -math.inf) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float, np.number)):
+        raise SceneError(f"{owner}: {name} = {value!r} must be a number")
+    value = float(value)
+    if not math.isfinite(value) or not value > above:
+        limit = "finite" if above == -math.inf else f"finite and above {above:g}"
+        raise SceneError(f"{owner}: {name} = {value!r} must be {limit}")
+    return value
+
+
+def _count(owner: str, name: str, value: Any, least: int) -> int:
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
+        raise SceneError(f"{owner}: {name} = {value!r} must be a whole number >= {least}")
+    return int(value)
+
+
+def _tuple(owner: str, name: str, value: Any, check: Callable[[Any], Any], length: int) -> tuple:
+    try:
+        items = tuple(value)
+    except TypeError:
+        items = ()
+    if isinstance(value, str) or len(items) != length:
+        raise SceneError(f"{owner}: {name} = {value!r} must have {length} entries")
+    return tuple(check(item) for item in items)
+
+
+def _vector(owner: str, name: str, value: Any) -> Any:
+    return _tuple(owner, name, value, lambda item: _number(owner, name, item), 2)
+
+
+class _Checked:
+    """Sets fields of a frozen dataclass to their checked values."""
+
+    def _set(self, **values: Any) -> None:
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
+
+
+@dataclass(frozen=True)
+class Grid(_Checked):
+    """Square cells of a Cartesian grid with its corner at the origin.
+
+    Parameters
+    ----------
+    cells : (int, int)
+        Number of cells along x and y.
+    dx : float
+        Width of a cell, in the scene's unit of length.
+    """
+
+    cells: tuple[int, int]
+    dx: float
+
+    def __post_init__(self) -> None:
+        self._set(
+            cells=_tuple("Grid", "cells", self.cells, lambda n: _count("Grid", "cells", n, 4), 2),
+            dx=_number("Grid", "dx", self.dx, above=0.0),
+        )
+
+    @property
+    def size(self) -> Vector:
+        """Width and height of the grid."""
+        return self.cells[0] * self.dx, self.cells[1] * self.dx
+
+
+@dataclass(frozen=True)
+class Material(_Checked):
+    """Compressible neo-Hookean solid, and how weak its absence is.
+
+    Parameters
+    ----------
+    lame_lambda, lame_mu : float
+        Lame constants (stress).
+    density : float
+        Reference mass density.
+    stiffness_floor, mass_floor : float
+        Share of stiffness and of mass that a void particle (gamma = 0) keeps: the paper's
+        epsilon, one number each.
+    """
+
+    lame_lambda: float = 10.0
+    lame_mu: float = 10.0
+    density: float = 1.0
+    stiffness_floor: float = 1e-3
+    mass_floor: float = 1e-3
+
+    def __post_init__(self) -> None:
+        for name in ("lame_mu", "density", "stiffness_floor", "mass_floor"):
+            self._set(**{name: _number("Material", name, getattr(self, name), above=0.0)})
+        self._set(lame_lambda=_number("Material", "lame_lambda", self.lame_lambda))
+        if self.lame_lambda < 0.0:
+            raise SceneError(f"Material: lame_lambda = {self.lame_lambda!r} must not be negative")
+        for name in ("stiffness_floor", "mass_floor"):
+            if getattr(self, name) > 1.0:
+                raise SceneError(f"Material: {name} = {getattr(self, name)!r} must be at most 1")
+
+    @property
+    def wave_speed(self) -> float:
+        """Speed of pressure waves, sqrt((lambda + 2 mu) / rho)."""
+        return math.sqrt((self.lame_lambda + 2.0 * self.lame_mu) / self.density)
+
+
+@dataclass(frozen=True)
+class Region(_Checked):
+    """Axis-parallel rectangle of the body; its edges lie on lines of the particle lattice.
+
+    Parameters
+    ----------
+    lower, upper : (float, float)
+        Lower left and upper right corner.
+    """
+
+    kind: ClassVar[str]
+
+    lower: Vector
+    upper: Vector
+
+    def __post_init__(self) -> None:
+        owner = type(self).__name__
+        self._set(
+            lower=_vector(owner, "lower", self.lower), upper=_vector(owner, "upper", self.upper)
+        )
+        if not (self.lower[0] < self.upper[0] and self.lower[1] < self.upper[1]):
+            raise SceneError(
+                f"{owner}: lower corner {self.lower} must be left of and below upper {self.upper}"
+            )
+
+    def overlaps(self, other: Region) -> bool:
+        """Whether the two rectangles share an area."""
+        return all(
+            self.lower[k] < other.upper[k] and other.lower[k] < self.upper[k] for k in (0, 1)
+        )
+
+
+@dataclass(frozen=True)
+class Design(Region):
+    """Part of the body whose material is designed."""
+
+    kind = "design"
+
+
+@dataclass(frozen=True)
+class Solid(Region):
+    """Part of the body that is solid whatever the design."""
+
+    kind = "solid"
+
+
+@dataclass(frozen=True)
+class Actuator(Region):
+    """Solid part of the body that an actuation stress squeezes.
+
+    Parameters
+    ----------
+    stress : ((float, float), (float, float))
+        Second Piola-Kirchhoff stress S of a unit signal; symmetric.
+    angular_frequency : float
+        omega of the signal s(t) = a sin(omega t + pi theta) + b, per unit of time.
+    """
+
+    kind = "actuator"
+
+    stress: tuple[Vector, Vector] = ((2.0, 0.0), (0.0, 2.0))
+    angular_frequency: float = 30.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        rows = _tuple("Actuator", "stress", self.stress, lambda r: r, 2)
+        stress = tuple(_vector("Actuator", "stress", row) for row in rows)
+        if stress[0][1] != stress[1][0]:
+            raise SceneError(
+                f"Actuator: a second Piola-Kirchhoff stress is symmetric, but S_xy = "
+                f"{stress[0][1]!r} and S_yx = {stress[1][0]!r}"
+            )
+        omega = _number("Actuator", "angular_frequency", self.angular_frequency, above=0.0)
+        self._set(stress=stress, angular_frequency=omega)
+
+
+@dataclass(frozen=True)
+class Wall(_Checked):
+    """Axis-parallel rigid wall: nodes strictly behind it are clamped while they approach it.
+
+    Bodies touch it when their kernels do: the centre of a particle comes to rest about one cell
+    in front of `position`.
+
+    Parameters
+    ----------
+    axis : {"x", "y"}
+        Axis of the wall's normal: a floor has "y".
+    position : float
+        Coordinate of the wall on that axis.
+    solid_side : {"below", "above"}
+        Side of `position` that is solid, towards smaller or larger coordinates.
+    friction : float or "stick"
+        Coulomb's coefficient (0: free slip), or no slip at all while approaching.
+    """
+
+    axis: Literal["x", "y"]
+    position: float
+    solid_side: Literal["below", "above"] = "below"
+    friction: float | Literal["stick"] = "stick"
+
+    def __post_init__(self) -> None:
+        if self.axis not in ("x", "y"):
+            raise SceneError(f'Wall: axis = {self.axis!r} must be "x" or "y"')
+        if self.solid_side not in ("below", "above"):
+            raise SceneError(f'Wall: solid_side = {self.solid_side!r} must be "below" or "above"')
+        self._set(position=_number("Wall", "position", self.position))
+        if self.friction != "stick":
+            friction = _number("Wall", 'friction (or "stick")', self.friction)
+            if friction < 0.0:
+                raise SceneError(f"Wall: friction = {friction!r} must not be negative")
+            self._set(friction=friction)
+
+
+@dataclass(frozen=True)
+class Scene(_Checked):
+    """One body, what surrounds it, and the way it shall go.
+
+    Units are free but must agree: with metres, seconds and kilograms per square metre, stresses
+    are in newtons per metre.
+
+    Parameters
+    ----------
+    grid : Grid
+    time_step : float
+        Length of an explicit step.
+    steps : int
+        Number of steps.
+    body : tuple of Region
+        `Design`, `Solid` and `Actuator` rectangles that do not overlap.
+    walls : tuple of Wall, optional
+    material : Material, optional
+    gravity : (float, float), optional
+    direction : (float, float), optional
+        Unit vector e of the objective.
+    particles_per_cell : int, optional
+        Particles per cell and direction.
+    filter_weights : (float, float, float), optional
+        Weights w0, w1, w2 of the design filter's 3 x 3 convolution: w0 + 4 w1 + 4 w2 = 1.
+
+    Raises
+    ------
+    SceneError
+        If anything is of the wrong kind or the parts do not fit together.
+    """
+
+    grid: Grid
+    time_step: float
+    steps: int
+    body: tuple[Region, ...]
+    walls: tuple[Wall, ...] = ()
+    material: Material = Material()
+    gravity: Vector = (0.0, 0.0)
+    direction: Vector = (1.0, 0.0)
+    particles_per_cell: int = 2
+    filter_weights: tuple[float, float, float] = (0.64, 0.08, 0.01)
+
+    def __post_init__(self) -> None:
+        for name, kind in (("grid", Grid), ("material", Material)):
+            if not isinstance(getattr(self, name), kind):
+                raise SceneError(f"Scene: {name} must be a {kind.__name__}")
+        for name, part in (("body", Region), ("walls", Wall)):
+            value = getattr(self, name)
+            if not isinstance(value, (tuple, list)) or not all(isinstance(v, part) for v in value):
+                raise SceneError(f"Scene: {name} must be a tuple of {part.__name__} objects")
+            self._set(**{name: tuple(value)})
+        self._set(
+            time_step=_number("Scene", "time_step", self.time_step, above=0.0),
+            steps=_count("Scene", "steps", self.steps, 1),
+            gravity=_vector("Scene", "gravity", self.gravity),
+            direction=_vector("Scene", "direction", self.direction),
+            particles_per_cell=_count("Scene", "particles_per_cell", self.particles_per_cell, 1),
+            filter_weights=_tuple(
+                "Scene",
+                "filter_weights",
+                self.filter_weights,
+                lambda w: _number("Scene", "filter_weights", w, above=0.0),
+                3,
+            ),
+        )
+        if abs(math.hypot(*self.direction) - 1.0) > 1e-12:
+            raise SceneError(
+                f"Scene: direction {self.direction} has length {math.hypot(*self.direction):.15g}, "
+                "must have length 1; divide it by its length"
+            )
+        w0, w1, w2 = self.filter_weights
+        if abs(w0 + 4.0 * w1 + 4.0 * w2 - 1.0) > 1e-12:
+            raise SceneError(
+                f"Scene: filter_weights sum to w0 + 4 w1 + 4 w2 = {w0 + 4 * w1 + 4 * w2:.15g}, "
+                "must sum to 1"
+            )
+        self._check_body()
+        self._check_walls()
+        self._check_stability()
+
+    def _check_body(self) -> None:
+        if not any(not isinstance(region, Design) for region in self.body):
+            raise SceneError(
+                "Scene: the body has no Solid and no Actuator, but the objective is where these go"
+            )
+        dx, size = self.grid.dx, self.grid.size
+        spacing = dx / self.particles_per_cell
+        for region in self.body:
+            name = f"Scene: {type(region).__name__} {region.lower} to {region.upper}"
+            for k in (0, 1):
+                if region.lower[k] < dx * (1.0 - ROUNDING) or region.upper[k] > size[k] - dx * (
+                    1.0 - ROUNDING
+                ):
+                    raise SceneError(
+                        f"{name} must lie within [{dx:g}, {size[k] - dx:g}] along {'xy'[k]}: "
+                        f"the grid's size is {size[k]:g}, less one cell at each end"
+                    )
+                for edge in (region.lower[k], region.upper[k]):
+                    if abs(edge / spacing - round(edge / spacing)) > ROUNDING:
+                        raise SceneError(
+                            f"{name}: edge {'xy'[k]} = {edge:.10g} is no multiple of the particle "
+                            f"spacing {spacing:.10g}; the nearest is "
+                            f"{round(edge / spacing) * spacing:.10g}"
+                        )
+        for i, region in enumerate(self.body):
+            for other in self.body[i + 1 :]:
+                if region.overlaps(other):
+                    raise SceneError(
+                        f"Scene: {type(region).__name__} {region.lower} to {region.upper} overlaps "
+                        f"{type(other).__name__} {other.lower} to {other.upper}"
+                    )
+
+    def _check_walls(self) -> None:
+        slack = ROUNDING * self.grid.dx
+        for wall in self.walls:
+            k = "xy".index(wall.axis)
+            if not 0.0 <= wall.position <= self.grid.size[k]:
+                raise SceneError(
+                    f"Scene: wall at {wall.axis} = {wall.position:g} is outside the grid, "
+                    f"which reaches from 0 to {self.grid.size[k]:g}"
+                )
+            for region in self.body:
+                depth = (
+                    wall.position - region.lower[k]
+                    if wall.solid_side == "below"
+                    else region.upper[k] - wall.position
+                )
+                if depth > slack:
+                    raise SceneError(
+                        f"Scene: {type(region).__name__} {region.lower} to {region.upper} reaches "
+                        f"{depth:g} into the wall at {wall.axis} = {wall.position:g}"
+                    )
+
+    def _check_stability(self) -> None:
+        if self.time_step > self.largest_time_step:
+            raise SceneError(
+                f"Scene: time_step = {self.time_step:g} is over the stability limit "
+                f"{self.largest_time_step:g} of a single particle; take a smaller step, larger "
+                "cells or a mass floor that is not below the stiffness floor"
+            )
+        for actuator in self.actuators:
+            largest = LARGEST_SIGNAL * np.abs(np.linalg.eigvalsh(actuator.stress)).max()
+            if self.material.lame_mu - largest <= 0.0:
+                raise SceneError(
+                    f"Scene: ellipticity can be lost: lame_mu = {self.material.lame_mu:g}, but the "
+                    f"actuation stress can reach -{largest:g} at a signal of "
+                    f"{LARGEST_SIGNAL:g}; keep it below lame_mu"
+                )
+
+    @property
+    def largest_time_step(self) -> float:
+        """Stability limit dx sqrt(rho / (2 (mu + lambda))) of an isolated particle.
+
+        The lightest particle counts: a void one where the mass floor is below the stiffness floor.
+        """
+        material = self.material
+        stiffness = 2.0 * (material.lame_mu + material.lame_lambda)
+        stiffest = max(1.0, material.stiffness_floor / material.mass_floor)
+        return self.grid.dx * math.sqrt(material.density / (stiffness * stiffest))
+
+    @property
+    def courant(self) -> float:
+        """Courant number of pressure waves in the solid, c_p dt / dx."""
+        return self.material.wave_speed * self.time_step / self.grid.dx
+
+    @property
+    def actuators(self) -> tuple[Actuator, ...]:
+        """The actuators in the body's order, which is that of a, theta and b."""
+        return tuple(region for region in self.body if isinstance(region, Actuator))
+
+    @property
+    def duration(self) -> float:
+        """Simulated time."""
+        return self.steps * self.time_step
+
+    def with_floors(self, mass: float, stiffness: float) -> Scene:
+        """The same scene with other floors of the void's mass and stiffness."""
+        material = dataclasses.replace(self.material, mass_floor=mass, stiffness_floor=stiffness)
+        return dataclasses.replace(self, material=material)
+
+    def with_time_step(self, time_step: float) -> Scene:
+        """The same scene and duration in steps of another length.
+
+        Raises
+        ------
+        SceneError
+            If the duration is no multiple of the new step.
+        """
+        time_step = _number("Scene", "time_step", time_step, above=0.0)
+        steps = round(self.duration / time_step)
+        if steps < 1 or abs(steps * time_step - self.duration) > 1e-9 * self.duration:
+            raise SceneError(
+                f"Scene: duration {self.duration:g} is no multiple of time_step = {time_step:g}; "
+                f"the nearest that divides it is {self.duration / max(steps, 1):.10g}"
+            )
+        return dataclasses.replace(self, time_step=time_step, steps=steps)
+
+    def to_json(self) -> str:
+        """The scene as JSON text, from which `from_json` makes exactly the same scene."""
+        data = dataclasses.asdict(self)
+        for region, item in zip(self.body, data["body"], strict=True):
+            item["kind"] = region.kind
+        return json.dumps(data, indent=1)
+
+    @staticmethod
+    def from_json(text: str) -> Scene:
+        """The scene that `to_json` wrote.
+
+        Raises
+        ------
+        SceneError
+            If the text is no JSON, keys are unknown or missing, or values do not fit.
+        """
+        try:
+            data = json.loads(text, parse_constant=_refuse_constant)
+        except (json.JSONDecodeError, UnicodeDecodeError, TypeError, RecursionError) as error:
+            raise SceneError(f"Scene: not JSON: {error}") from error
+        data = dict(_object("Scene", data))
+        for name, part in (("grid", Grid), ("material", Material)):
+            if name in data:
+                data[name] = _build(part, data[name])
+        if "body" in data:
+            kinds = {part.kind: part for part in (Design, Solid, Actuator)}
+            regions = []
+            for item in _array("body", data["body"]):
+                item = dict(_object("Region", item))
+                kind = item.pop("kind", None)
+                if not isinstance(kind, str) or kind not in kinds:
+                    raise SceneError(f"Region: kind = {kind!r} must be one of {sorted(kinds)}")
+                regions.append(_build(kinds[kind], item))
+            data["body"] = tuple(regions)
+        if "walls" in data:
+            data["walls"] = tuple(_build(Wall, item) for item in _array("walls", data["walls"]))
+        return _build(Scene, data)
+
+
+def _refuse_constant(name: str) -> float:
+    raise SceneError(f"Scene: {name} is not a number that a scene can hold")
+
+
+def _object(owner: str, data: Any) -> dict[str, Any]:
+    if not isinstance(data, dict):
+        raise SceneError(f"{owner}: expected a JSON object, got {type(data).__name__}")
+    return data
+
+
+def _array(owner: str, data: Any) -> list[Any]:
+    if not isinstance(data, list):
+        raise SceneError(f"{owner}: expected a JSON array, got {type(data).__name__}")
+    return data
+
+
+def _build(part: Any, data: Any) -> Any:
+    name = part.__name__
+    data = _object(name, data)
+    fields = {field.name: field for field in dataclasses.fields(part)}
+    unknown = sorted(set(data) - set(fields))
+    if unknown:
+        raise SceneError(f"{name}: unknown keys {unknown}; known are {sorted(fields)}")
+    missing = [
+        key
+        for key, field in fields.items()
+        if field.default is dataclasses.MISSING and key not in data
+    ]
+    if missing:
+        raise SceneError(f"{name}: keys {missing} are missing")
+    return part(**data)

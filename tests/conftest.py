@@ -1,0 +1,44 @@
+"""Fixtures of all tests; numpy errors raise."""
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from mpmopt.scene import Actuator, Design, Grid, Material, Scene, Solid, Wall
+
+
+@pytest.fixture(autouse=True)
+def numpy_errors_raise() -> Iterator[None]:
+    with np.errstate(divide="raise", over="raise", invalid="raise"):
+        yield
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(20260101)
+
+
+def small_scene(**changes) -> Scene:
+    """A walker of 48 particles with two actuators, on a floor with friction and beside a wall."""
+    c = 1 / 16
+    scene = {
+        "grid": Grid(cells=(16, 16), dx=c),
+        "time_step": 4e-3,
+        "steps": 40,
+        "material": Material(mass_floor=1e-2, stiffness_floor=1e-3),
+        "gravity": (0.5, -10.0),
+        "walls": (Wall("y", 4 * c, friction=0.3), Wall("x", 3 * c)),
+        "body": (
+            Design((3 * c, 4 * c), (7 * c, 6 * c)),
+            Actuator((3 * c, 6 * c), (4 * c, 7 * c), stress=((2.0, 0.5), (0.5, 1.0))),
+            Solid((4 * c, 6 * c), (6 * c, 7 * c)),
+            Actuator((6 * c, 6 * c), (7 * c, 7 * c), angular_frequency=50.0),
+        ),
+    }
+    return Scene(**{**scene, **changes})
+
+
+@pytest.fixture
+def scene() -> Scene:
+    return small_scene()

@@ -1,0 +1,140 @@
+"""A scene is checked on construction and survives JSON exactly."""
+
+import dataclasses
+import json
+import math
+
+import pytest
+from conftest import small_scene
+from walker import CASES, walker
+
+from mpmopt.errors import SceneError
+from mpmopt.scene import Actuator, Design, Grid, Material, Region, Scene, Solid, Wall
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_json_gives_back_exactly_the_same_scene(case):
+    scene = CASES[case].scene
+    assert Scene.from_json(scene.to_json()) == scene
+
+
+def test_json_keeps_every_bit_of_odd_numbers():
+    scene = small_scene(time_step=math.pi * 1e-3, gravity=(1 / 3, -9.80665), direction=(0.6, 0.8))
+    again = Scene.from_json(scene.to_json())
+    assert again == scene
+    assert again.time_step.hex() == scene.time_step.hex()
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda d: d.update(timestep=1.0),
+        lambda d: d.pop("grid"),
+        lambda d: d.update(grid=[16, 16]),
+        lambda d: d["grid"].update(dz=1.0),
+        lambda d: d["body"][0].update(kind="liquid"),
+        lambda d: d["body"][0].pop("kind"),
+        lambda d: d["body"][0].update(kind=["design"]),
+        lambda d: d["walls"][0].update(axis="z"),
+        lambda d: d.update(body={}),
+        lambda d: d.update(walls=[1]),
+        lambda d: d.update(steps=2.5),
+        lambda d: d.update(steps=True),
+        lambda d: d.update(time_step="0.001"),
+        lambda d: d.update(time_step=float("nan")),
+        lambda d: d.update(gravity=[0.0, float("inf")]),
+        lambda d: d.update(gravity=[0.0]),
+        lambda d: d.update(direction="ab"),
+    ],
+)
+def test_json_that_is_no_scene_is_refused(damage, scene):
+    data = json.loads(scene.to_json())
+    damage(data)
+    with pytest.raises(SceneError):
+        Scene.from_json(json.dumps(data))
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "null", "3", '"scene"', "[" * 100000])
+def test_text_that_is_no_json_object_is_refused(text):
+    with pytest.raises(SceneError):
+        Scene.from_json(text)
+
+
+C = 1 / 16
+
+
+@pytest.mark.parametrize(
+    ("build", "says"),
+    [
+        (lambda: Grid((16, 0), C), ["0"]),
+        (lambda: Grid((16, 16), -1.0), ["-1.0", "above 0"]),
+        (lambda: Material(density=0.0), ["density", "0.0"]),
+        (lambda: Material(lame_lambda=-1.0), ["-1.0"]),
+        (lambda: Material(mass_floor=2.0), ["2.0", "at most 1"]),
+        (lambda: Design((0.2, 0.2), (0.1, 0.3)), ["0.2", "0.1"]),
+        (lambda: Actuator((0, 0), (1, 1), stress=((1.0, 2.0), (3.0, 1.0))), ["2.0", "3.0"]),
+        (lambda: Actuator((0, 0), (1, 1), stress=(1.0, 2.0)), ["2 entries"]),
+        (lambda: Wall("y", 0.1, friction=-0.5), ["-0.5"]),
+        (lambda: Wall("y", 0.1, solid_side="left"), ["left"]),
+        (lambda: small_scene(direction=(1.0, 1.0)), ["1.41421356", "length 1"]),
+        (lambda: small_scene(filter_weights=(0.5, 0.1, 0.1)), ["1.3", "sum to 1"]),
+        (lambda: small_scene(body=()), ["no Solid and no Actuator"]),
+        (lambda: small_scene(body=(Design((3 * C, 4 * C), (6 * C, 6 * C)),)), ["objective"]),
+        (lambda: small_scene(body=(Solid((0.0, 4 * C), (C, 5 * C)),)), ["0.0625", "0.9375"]),
+        (lambda: small_scene(body=(Solid((4 * C, 5 * C), (5 * C, 0.99)),)), ["0.99", "0.9375"]),
+        (lambda: small_scene(body=(Solid((0.26, 4 * C), (0.5, 0.5)),)), ["0.26", "0.03125", "0.25"]),
+        (
+            lambda: small_scene(
+                body=(
+                    Solid((4 * C, 5 * C), (6 * C, 7 * C)),
+                    Solid((5 * C, 6 * C), (7 * C, 8 * C)),
+                )
+            ),
+            ["overlaps"],
+        ),
+        (lambda: small_scene(walls=(Wall("y", 5 * C),)), ["0.0625 into the wall", "0.3125"]),
+        (lambda: small_scene(walls=(Wall("y", 1.5),)), ["1.5", "outside the grid"]),
+        (lambda: small_scene(time_step=0.1), ["0.1", "0.00988", "stability"]),
+        (lambda: small_scene(material=Material(mass_floor=1e-4)), ["0.004", "0.0031"]),
+        (lambda: small_scene(material=Material(lame_mu=4.0)), ["lame_mu = 4", "-4"]),
+        (lambda: small_scene(particles_per_cell=0), ["0", ">= 1"]),
+        (lambda: small_scene(grid=16), ["Grid"]),
+        (lambda: small_scene(body=(1,)), ["Region"]),
+    ],
+)
+def test_what_cannot_be_simulated_is_refused_with_the_numbers(build, says):
+    with pytest.raises(SceneError) as error:
+        build()
+    for part in says:
+        assert part in str(error.value)
+
+
+def test_stability_limit_is_that_of_an_isolated_particle():
+    # dx sqrt(rho / (2 (mu + lambda))) is 0.866 dx / c_p for lambda = mu.
+    scene = walker(64, 8e-4)
+    limit = math.sqrt(3.0) / 2.0 * scene.grid.dx / scene.material.wave_speed
+    assert scene.largest_time_step == pytest.approx(limit, rel=1e-14)
+    assert walker(128, 2e-4).courant == pytest.approx(0.140, abs=5e-4)
+
+
+def test_light_stiff_void_lowers_the_stability_limit(scene):
+    light = scene.with_floors(mass=1e-3, stiffness=2e-3)
+    assert light.largest_time_step == pytest.approx(scene.largest_time_step / math.sqrt(2.0))
+
+
+def test_another_time_step_keeps_the_duration(scene):
+    finer = scene.with_time_step(1e-3)
+    assert (finer.steps, finer.time_step) == (160, 1e-3)
+    with pytest.raises(SceneError, match=r"0\.16 is no multiple of time_step = 0\.003"):
+        scene.with_time_step(3e-3)
+
+
+def test_a_scene_cannot_be_changed(scene):
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        scene.steps = 1
+
+
+def test_regions_that_share_an_edge_do_not_overlap():
+    left, right = Region((0.0, 0.0), (1.0, 1.0)), Region((1.0, 0.0), (2.0, 1.0))
+    assert not left.overlaps(right)
+    assert left.overlaps(Region((0.5, 0.5), (0.6, 0.6)))
