@@ -1,0 +1,140 @@
+"""From design variables to material: filter, projection, interpolation, and the way back."""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.sparse
+from numpy.typing import NDArray
+
+from mpmopt.errors import DesignError
+from mpmopt.mpm import weights
+from mpmopt.particles import Particles
+from mpmopt.scene import Material, Scene
+
+
+def interpolation_matrix(
+    position: NDArray[np.float64], scene: Scene
+) -> scipy.sparse.csr_array[np.float64]:
+    """Quadratic B-spline weights w_ip (particles, nodes); node (i, j) is column i * (ny + 1) + j."""
+    dx, rows = scene.grid.dx, scene.grid.cells[1] + 1
+    entries, columns = [], []
+    for x, y in position:
+        i, wx, _ = weights(x, dx)
+        j, wy, _ = weights(y, dx)
+        entries.append(np.outer(wx, wy).ravel())
+        columns.append(((i + np.arange(3))[:, None] * rows + j + np.arange(3)).ravel())
+    start = np.arange(0, 9 * len(position) + 1, 9)
+    shape = (len(position), (scene.grid.cells[0] + 1) * rows)
+    return scipy.sparse.csr_array(
+        (np.concatenate(entries), np.concatenate(columns), start), shape=shape
+    )
+
+
+def filter_matrix(scene: Scene, particles: Particles) -> scipy.sparse.csr_array[np.float64]:
+    """The paper's filter (sec. 2.3, steps 1 to 3) as one matrix (D, D) over the D design particles.
+
+    Particle to grid, 3 x 3 convolution, grid to particle. Only design particles take part; nodes
+    that carry none are left out and the weights that remain are scaled to sum to one, so that a
+    constant field stays constant.
+    """
+    to_particles = interpolation_matrix(particles.position[particles.designed], scene)
+    used = np.flatnonzero(to_particles.sum(axis=0))
+    to_particles = to_particles[:, used]
+
+    w0, w1, w2 = scene.filter_weights
+    rows = scene.grid.cells[1] + 1
+    entry = np.full((scene.grid.cells[0] + 1) * rows, -1)
+    entry[used] = np.arange(used.size)
+    pairs, values = [], []
+    for di in (-1, 0, 1):
+        for dj in (-1, 0, 1):
+            # Used nodes keep a cell's distance from the grid's edge, so no row wraps round.
+            neighbour = entry[used + di * rows + dj]
+            exists = neighbour >= 0
+            pairs.append(np.stack([np.flatnonzero(exists), neighbour[exists]]))
+            values.append(np.full(exists.sum(), (w0, w1, w2)[abs(di) + abs(dj)]))
+    row, column = np.concatenate(pairs, axis=1)
+    shape = (used.size, used.size)
+    convolution = scipy.sparse.csr_array((np.concatenate(values), (row, column)), shape=shape)
+
+    def normalised(matrix: scipy.sparse.csr_array) -> scipy.sparse.csr_array:
+        return scipy.sparse.diags_array(1.0 / matrix.sum(axis=1)) @ matrix
+
+    to_grid = normalised(to_particles.T.tocsr())
+    return (to_particles @ (normalised(convolution) @ to_grid)).tocsr()
+
+
+def project(phi: NDArray, beta: float) -> NDArray:
+    """Smoothed Heaviside gamma = (tanh(beta phi) / tanh(beta) + 1) / 2."""
+    return 0.5 * (np.tanh(beta * phi) / np.tanh(beta) + 1.0)
+
+
+def project_adjoint(phi: NDArray, beta: float, gamma_bar: NDArray) -> NDArray:
+    """phi_bar from gamma_bar."""
+    return gamma_bar * 0.5 * beta / np.tanh(beta) / np.cosh(beta * phi) ** 2
+
+
+def greyness(gamma: NDArray) -> float:
+    """Mean of 4 gamma (1 - gamma): 0 for a black and white design, 1 for a uniformly grey one."""
+    return float(np.mean(4.0 * gamma * (1.0 - gamma))) if gamma.size else 0.0
+
+
+class DesignChain:
+    """Design variables phi (D,) in [-1, 1] to mass density and Lame constants of all N particles.
+
+    Parameters
+    ----------
+    scene : Scene
+        Its material and filter weights.
+    particles : Particles
+    beta : float
+        Sharpness of the projection, > 0.
+
+    Raises
+    ------
+    DesignError
+        If beta is not positive and finite.
+    """
+
+    def __init__(self, scene: Scene, particles: Particles, beta: float) -> None:
+        if not (np.isfinite(beta) and beta > 0.0):
+            raise DesignError(f"beta = {beta!r} must be finite and above 0")
+        self.beta = float(beta)
+        self.filter = filter_matrix(scene, particles)
+        self._designed = particles.designed
+        self._material = scene.material
+
+    def gamma(self, phi: NDArray) -> NDArray:
+        """Material density (D,) of the design particles, within [0, 1]."""
+        return project(self.filter @ phi, self.beta)
+
+    def material(self, phi: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+        """rho, lambda and mu of all particles, (N,) each."""
+        gamma = np.ones(self._designed.size, dtype=np.asarray(phi).dtype)
+        gamma[self._designed] = self.gamma(phi)
+        return interpolate(self._material, gamma)
+
+    def pullback(
+        self, phi: NDArray, density_bar: NDArray, lambda_bar: NDArray, mu_bar: NDArray
+    ) -> NDArray:
+        """phi_bar (D,) from the adjoints of rho, lambda and mu, (N,) each."""
+        gamma_bar = interpolate_adjoint(self._material, density_bar, lambda_bar, mu_bar)
+        phi_bar = project_adjoint(self.filter @ phi, self.beta, gamma_bar[self._designed])
+        return self.filter.T @ phi_bar
+
+
+def interpolate(material: Material, gamma: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+    """rho, lambda and mu, linear in gamma between the floors and the solid (paper, sec. 2.2)."""
+    mass = (1.0 - material.mass_floor) * gamma + material.mass_floor
+    stiffness = (1.0 - material.stiffness_floor) * gamma + material.stiffness_floor
+    return material.density * mass, material.lame_lambda * stiffness, material.lame_mu * stiffness
+
+
+def interpolate_adjoint(
+    material: Material, density_bar: NDArray, lambda_bar: NDArray, mu_bar: NDArray
+) -> NDArray:
+    """gamma_bar from the adjoints of rho, lambda and mu."""
+    stiffness_bar = material.lame_lambda * lambda_bar + material.lame_mu * mu_bar
+    return (1.0 - material.mass_floor) * material.density * density_bar + (
+        1.0 - material.stiffness_floor
+    ) * stiffness_bar

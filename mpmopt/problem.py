@@ -1,0 +1,159 @@
+"""Scene and design to objective and gradient: all that an optimiser sees."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpmopt.actuation import signal, signal_adjoint
+from mpmopt.checkpoints import Checkpointing, Checkpoints
+from mpmopt.design import DesignChain
+from mpmopt.errors import DesignError, SimulationError
+from mpmopt.objective import Objective
+from mpmopt.particles import lay_out
+from mpmopt.scene import Scene
+from mpmopt.simulate import Simulation
+
+
+class Variables(NamedTuple):
+    """Design variables by name, each within [-1, 1].
+
+    Attributes
+    ----------
+    phi : (D,) array
+        Of the design particles.
+    a, theta, b : (K,) arrays
+        Amplitude, phase and bias of the actuators.
+    """
+
+    phi: NDArray
+    a: NDArray
+    theta: NDArray
+    b: NDArray
+
+    @classmethod
+    def of(cls, x: NDArray, designed: int) -> Variables:
+        """The parts of a vector x whose first `designed` entries are phi."""
+        phi, rest = x[:designed], x[designed:]
+        return cls(phi, *rest.reshape(3, -1))
+
+
+class Problem:
+    """How far a design travels in a scene, and which way to change it.
+
+    The vector x of an optimiser is phi, a, theta, b in this order, all within [-1, 1].
+
+    Parameters
+    ----------
+    scene : Scene
+    beta : float, optional
+        Sharpness of the projection.
+    checkpointing : Checkpointing, optional
+
+    Attributes
+    ----------
+    particles : Particles
+    chain : DesignChain
+    size : int
+        Number of design variables, D + 3 K.
+    """
+
+    def __init__(
+        self, scene: Scene, beta: float = 1.0, checkpointing: Checkpointing | None = None
+    ) -> None:
+        self.scene = scene
+        self.checkpointing = checkpointing or Checkpointing()
+        self.particles = lay_out(scene)
+        self.chain = DesignChain(scene, self.particles, beta)
+        self.objective = Objective.of(self.particles, scene.direction)
+        self._designed = int(self.particles.designed.sum())
+        self.size = self._designed + 3 * len(scene.actuators)
+
+    def join(self, phi: Any, a: Any, theta: Any, b: Any) -> NDArray[np.float64]:
+        """The vector x of named variables; single numbers stand for all entries."""
+        shapes = (self._designed,) + 3 * (len(self.scene.actuators),)
+        parts = [np.broadcast_to(v, n) for v, n in zip((phi, a, theta, b), shapes, strict=True)]
+        return np.concatenate(parts).astype(float)
+
+    def split(self, x: NDArray) -> Variables:
+        """The named variables of a vector x.
+
+        Raises
+        ------
+        DesignError
+            If x has another size, or an entry is not finite or outside [-1, 1].
+        """
+        x = np.asarray(x)
+        if x.shape != (self.size,):
+            raise DesignError(f"x has shape {x.shape}, this problem's variables {(self.size,)}")
+        outside = ~(np.abs(x.real) <= 1.0)
+        if outside.any():
+            raise DesignError(
+                f"{outside.sum()} of {x.size} design variables are not within [-1, 1], the first "
+                f"is x[{outside.argmax()}] = {x[outside.argmax()]}"
+            )
+        return Variables.of(x, self._designed)
+
+    def gamma(self, x: NDArray) -> NDArray:
+        """Material density (D,) of the design particles."""
+        return self.chain.gamma(self.split(x).phi)
+
+    def simulation(self, x: NDArray) -> Simulation:
+        """The simulation of a design."""
+        phi, a, theta, b = self.split(x)
+        return Simulation(
+            self.scene,
+            self.particles,
+            *self.chain.material(phi),
+            signal=signal(self.scene, a, theta, b),
+        )
+
+    def value(self, x: NDArray) -> Any:
+        """Objective L of a design, larger is farther; complex if x is complex.
+
+        Raises
+        ------
+        DesignError
+            If x does not fit.
+        SimulationError
+            If the simulation fails.
+        """
+        simulation = self.simulation(x)
+        return _finite(self.objective.value(simulation.run()), simulation)
+
+    def value_and_gradient(self, x: NDArray) -> tuple[float, NDArray[np.float64]]:
+        """Objective L and its gradient (D + 3 K,), by the reverse loop.
+
+        Raises
+        ------
+        DesignError, SimulationError
+            As `value`; a gradient that is not finite is a SimulationError too.
+        StorageError
+            If checkpoints cannot be stored or read back.
+        """
+        phi, a, theta, _ = self.split(x)
+        simulation = self.simulation(x)
+        schedule = simulation.schedule(self.checkpointing)
+        with Checkpoints(schedule, self.checkpointing.store) as checkpoints:
+            forward = simulation.forward(checkpoints)
+            value = float(_finite(self.objective.value(forward.state), simulation))
+            bars = forward.reverse(self.objective.seed(forward.state))
+        phi_bar = self.chain.pullback(phi, bars.density, bars.lame_lambda, bars.lame_mu)
+        gradient = np.concatenate(
+            [phi_bar, *signal_adjoint(self.scene, a, theta, bars.signal)]
+        )
+        return value, _finite(gradient, simulation)
+
+
+def _finite(values: Any, simulation: Simulation) -> Any:
+    if not np.all(np.isfinite(values)):
+        raise SimulationError(
+            f"{np.sum(~np.isfinite(values))} of {np.size(values)} results are not finite",
+            simulation.steps,
+            -1,
+            (np.nan, np.nan),
+            f"take a smaller time step (now {simulation.scene.time_step:g})",
+        )
+    return values

@@ -1,0 +1,361 @@
+"""Forward and reverse loops over the steps of one body in one scene."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpmopt import mpm
+from mpmopt.checkpoints import Checkpointing, Checkpoints, Schedule
+from mpmopt.errors import DesignError, SimulationError
+from mpmopt.particles import Particles
+from mpmopt.scene import ROUNDING, Scene
+
+# The kernel returns to Python this often, so that signals are heard in time.
+STEPS_PER_CALL = 100
+
+
+def world_of(scene: Scene) -> mpm.World:
+    """The scene's surroundings as the kernels see them."""
+    dx = scene.grid.dx
+    nodes = []
+    for wall in scene.walls:
+        # The first node that is not strictly behind the wall.
+        if wall.solid_side == "below":
+            nodes.append(math.ceil(wall.position / dx - ROUNDING))
+        else:
+            nodes.append(math.floor(wall.position / dx + ROUNDING))
+    return mpm.World(
+        dt=scene.time_step,
+        dx=dx,
+        nodes_x=scene.grid.cells[0] + 1,
+        nodes_y=scene.grid.cells[1] + 1,
+        gravity_x=scene.gravity[0],
+        gravity_y=scene.gravity[1],
+        wall_axis=np.array(["xy".index(w.axis) for w in scene.walls], dtype=np.int64),
+        wall_side=np.array(
+            [1 if w.solid_side == "below" else -1 for w in scene.walls], dtype=np.int64
+        ),
+        wall_node=np.array(nodes, dtype=np.int64),
+        wall_friction=np.array(
+            [np.inf if w.friction == "stick" else w.friction for w in scene.walls], dtype=float
+        ),
+    )
+
+
+@dataclass(frozen=True)
+class Gradient:
+    """Derivatives of the objective with respect to a simulation's inputs.
+
+    Attributes
+    ----------
+    density, lame_lambda, lame_mu : (N,) arrays
+    signal : (steps, K) array
+    state : (12, N) array
+        With respect to the initial state.
+    """
+
+    density: NDArray[np.float64]
+    lame_lambda: NDArray[np.float64]
+    lame_mu: NDArray[np.float64]
+    signal: NDArray[np.float64]
+    state: NDArray[np.float64]
+
+
+class Simulation:
+    """One body, its material and its actuators' signals, ready to run.
+
+    Parameters
+    ----------
+    scene : Scene
+        Grid, time, walls, gravity, and the actuators' stresses.
+    particles : Particles
+        N of them.
+    density, lame_lambda, lame_mu : (N,) arrays
+        Real, or complex for the complex step.
+    signal : (steps, K) array
+        Of the scene's K actuators; real or complex.
+    state : (12, N) array, optional
+        Initial state (layout: `mpmopt.mpm`); default: at rest and undeformed.
+
+    Raises
+    ------
+    DesignError
+        If shapes do not fit, or a value is not finite or not positive where it must be.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        particles: Particles,
+        density: NDArray,
+        lame_lambda: NDArray,
+        lame_mu: NDArray,
+        signal: NDArray,
+        state: NDArray | None = None,
+    ) -> None:
+        count = len(particles.position)
+        if state is None:
+            state = np.zeros((mpm.STATE_SIZE, count))
+            state[0:2] = particles.position.T
+            state[8] = state[11] = 1.0
+        dtype = np.result_type(density, lame_lambda, lame_mu, signal, state, float)
+        shapes = {
+            "density": (density, (count,)),
+            "lame_lambda": (lame_lambda, (count,)),
+            "lame_mu": (lame_mu, (count,)),
+            "signal": (signal, (scene.steps, len(scene.actuators))),
+            "state": (state, (mpm.STATE_SIZE, count)),
+        }
+        for name, (array, shape) in shapes.items():
+            if np.shape(array) != shape:
+                raise DesignError(f"{name} has shape {np.shape(array)}, must have {shape}")
+            if not np.all(np.isfinite(array)):
+                raise DesignError(f"{name} holds {np.sum(~np.isfinite(array))} values not finite")
+        if count == 0:
+            raise DesignError("the body has no particles")
+        if not np.real(density).min() > 0.0:
+            raise DesignError(f"density {np.real(density).min():g} must be above 0")
+        self.scene = scene
+        self.particles = particles
+        self.world = world_of(scene)
+        self.volume = particles.volume
+        stress = [(S[0][0], S[0][1], S[1][1]) for S in (a.stress for a in scene.actuators)]
+        self.body = mpm.Body(
+            volume=particles.volume.astype(dtype),
+            mass=(particles.volume * density).astype(dtype),
+            lame_lambda=np.ascontiguousarray(lame_lambda, dtype=dtype),
+            lame_mu=np.ascontiguousarray(lame_mu, dtype=dtype),
+            actuator=particles.actuator,
+            actuation_stress=np.array(stress, dtype=float).reshape(-1, 3),
+        )
+        self.signal = np.ascontiguousarray(signal, dtype=dtype)
+        self.initial = np.ascontiguousarray(state, dtype=dtype)
+
+    def run(self, frames: Sequence[int] | None = None) -> NDArray:
+        """Run forward and keep nothing.
+
+        Parameters
+        ----------
+        frames : sequence of int, optional
+            Increasing numbers of steps after which the state is wanted, 0 for the initial one.
+
+        Returns
+        -------
+        (12, N) array, the final state; or (len(frames), 12, N) array
+
+        Raises
+        ------
+        SimulationError
+            If a particle leaves the grid, inverts, or is not a number.
+        """
+        wanted = [self.scene.steps] if frames is None else list(frames)
+        if wanted != sorted(wanted) or (wanted and not 0 <= wanted[0] <= wanted[-1] <= self.steps):
+            raise DesignError(f"frames must increase from 0 to {self.steps}, got {wanted}")
+        memory = _Segment(self, 1)
+        states = memory.states
+        states[0] = self.initial
+        kept = []
+        step = 0
+        for frame in wanted:
+            while step < frame:
+                last = min(frame, step + STEPS_PER_CALL)
+                memory.advance(step, last)
+                states[0] = states[(last - step) % 2]
+                step = last
+            kept.append(states[0].copy())
+        return kept[-1] if frames is None else np.array(kept)
+
+    @property
+    def steps(self) -> int:
+        """Number of steps."""
+        return self.scene.steps
+
+    def schedule(self, wish: Checkpointing) -> Schedule:
+        """The checkpoint schedule that `value_and_gradient`'s loops will follow."""
+        nodes = _capacity(self)
+        itemsize = self.initial.itemsize
+        step_bytes = (self.initial.size + mpm.NODE_SIZE * nodes) * itemsize
+        return Schedule.choose(self.steps, step_bytes, wish)
+
+    def forward(self, checkpoints: Checkpoints) -> Forward:
+        """Run forward, storing what the checkpoints' schedule asks for.
+
+        Raises
+        ------
+        SimulationError
+            As `run`.
+        StorageError
+            If a checkpoint cannot be written.
+        """
+        schedule = checkpoints.schedule
+        memory = _Segment(self, schedule.segment)
+        memory.states[0] = self.initial
+        for index, (first, last) in enumerate(schedule.segments):
+            if not schedule.all_stored:
+                checkpoints.write(index, state=memory.states[0])
+            memory.advance(first, last)
+            if last < schedule.steps:
+                if schedule.all_stored:
+                    checkpoints.write(
+                        index, states=memory.states, grids=memory.grids, windows=memory.windows
+                    )
+                memory.states[0] = memory.states[last - first]
+        return Forward(self, checkpoints, memory)
+
+
+class _Segment:
+    """Working memory of a segment: the states and nodes of its steps, and scratch arrays."""
+
+    def __init__(self, simulation: Simulation, length: int) -> None:
+        self.simulation = simulation
+        count, dtype = simulation.initial.shape[1], simulation.initial.dtype
+        self.states = np.empty((length + 1, mpm.STATE_SIZE, count), dtype)
+        self.windows = np.zeros((length, 4), np.int64)
+        self.grids = np.empty((length, 0, mpm.NODE_SIZE), dtype)
+        self._affine, self._log_J = np.empty((4, count), dtype), np.empty(count, dtype)
+        self.resize(_capacity(simulation))
+
+    def resize(self, nodes: int) -> None:
+        """Make room for windows of so many nodes, keeping the grids."""
+        kept, dtype = self.grids, self.grids.dtype
+        self.grids = np.empty((len(kept), nodes, mpm.NODE_SIZE), dtype)
+        self.grids[:, : kept.shape[1]] = kept
+        self.scratch = mpm.Scratch(
+            affine=self._affine,
+            log_J=self._log_J,
+            velocity=np.empty((nodes, 2), dtype),
+            affine_bar=np.empty_like(self._affine),
+            velocity_bar=np.empty((nodes, 2), dtype),
+            node_bar=np.empty((nodes, mpm.NODE_SIZE), dtype),
+        )
+
+    def advance(self, first: int, last: int) -> None:
+        """Advance from step `first`, whose state is in slot 0, to step `last`."""
+        simulation = self.simulation
+        signal = simulation.signal[first:last]
+        reached, steps = 0, last - first
+        while reached < steps:
+            reached, end, particle = mpm.advance(
+                self.states,
+                self.grids,
+                self.windows,
+                reached,
+                min(steps, reached + STEPS_PER_CALL),
+                simulation.body,
+                simulation.world,
+                signal,
+                self.scratch,
+            )
+            if end == mpm.WINDOW_TOO_SMALL:
+                self.resize(2 * self.grids.shape[1])
+            elif end != mpm.DONE:
+                state = self.states[reached % len(self.states)]
+                raise _failure(simulation, end, first + reached, particle, state)
+
+
+class Forward:
+    """A forward run that is ready to be gone back through.
+
+    Attributes
+    ----------
+    state : (12, N) array
+        The final state.
+    """
+
+    def __init__(
+        self, simulation: Simulation, checkpoints: Checkpoints, memory: _Segment
+    ) -> None:
+        self._simulation, self._checkpoints, self._memory = simulation, checkpoints, memory
+        first, last = checkpoints.schedule.segments[-1]
+        self.state = memory.states[last - first].copy()
+
+    def reverse(self, seed: NDArray[np.float64]) -> Gradient:
+        """Go back through all steps from `seed`, the objective's derivative by the final state.
+
+        Raises
+        ------
+        StorageError
+            If a checkpoint cannot be read back.
+        """
+        simulation, memory = self._simulation, self._memory
+        schedule = self._checkpoints.schedule
+        bar = seed.copy()
+        body_bar = mpm.BodyBar(*(np.zeros(bar.shape[1]) for _ in mpm.BodyBar._fields))
+        signal_bar = np.zeros_like(simulation.signal)
+        segments = schedule.segments
+        for index in range(len(segments) - 1, -1, -1):
+            first, last = segments[index]
+            if last < schedule.steps:
+                self._recall(index, first, last)
+            for stop in range(last - first, 0, -STEPS_PER_CALL):
+                mpm.advance_adjoint(
+                    memory.states,
+                    memory.grids,
+                    memory.windows,
+                    max(0, stop - STEPS_PER_CALL),
+                    stop,
+                    simulation.body,
+                    simulation.world,
+                    simulation.signal[first:last],
+                    memory.scratch,
+                    bar,
+                    body_bar,
+                    signal_bar[first:last],
+                )
+        return Gradient(
+            density=simulation.volume * body_bar.mass,
+            lame_lambda=body_bar.lame_lambda,
+            lame_mu=body_bar.lame_mu,
+            signal=signal_bar,
+            state=bar,
+        )
+
+    def _recall(self, index: int, first: int, last: int) -> None:
+        """Bring the states and nodes of a segment back into memory."""
+        memory, checkpoints = self._memory, self._checkpoints
+        if checkpoints.schedule.all_stored:
+            grids = checkpoints.read(index, "grids")
+            memory.states[:] = checkpoints.read(index, "states")
+            memory.windows[:] = checkpoints.read(index, "windows")
+            memory.grids[:, : grids.shape[1]] = grids
+        else:
+            memory.states[0] = checkpoints.read(index, "state")
+            memory.advance(first, last)
+
+
+def _capacity(simulation: Simulation) -> int:
+    """Node records to start with: the initial window with a quarter to spare on each axis."""
+    position = np.real(simulation.initial[0:2])
+    cells = np.ptp(position, axis=1) / simulation.world.dx
+    cells = np.minimum(cells, (simulation.world.nodes_x, simulation.world.nodes_y))
+    return int(np.prod(np.ceil(1.25 * cells) + 4))
+
+
+def _failure(
+    simulation: Simulation, end: int, step: int, particle: int, state: NDArray
+) -> SimulationError:
+    x, y = (float(value) for value in np.real(state[0:2, particle]))
+    if end == mpm.INVERTED:
+        what = "its deformation gradient is inverted"
+    elif not (np.isfinite(x) and np.isfinite(y)):
+        what = "its position is not a number"
+    else:
+        width, height = simulation.scene.grid.size
+        margin = simulation.world.dx / 2
+        what = (
+            f"it left the grid ({margin:g} to {width - margin:g} by {margin:g} to "
+            f"{height - margin:g})"
+        )
+    scene = simulation.scene
+    hint = (
+        f"take a smaller time step (now {scene.time_step:g}, Courant {scene.courant:.2g}), a "
+        f"higher mass floor (now {scene.material.mass_floor:g}), weaker actuation"
+    )
+    if end == mpm.ESCAPED:
+        hint += ", or a larger grid"
+    return SimulationError(what, step, particle, (x, y), hint)

@@ -1,0 +1,432 @@
+"""Is the gradient right? Dot-product, complex-step and Taylor tests, of kernels and of problems.
+
+Three independent witnesses. The *dot-product* test compares each hand-written adjoint with the
+derivative of its own kernel: for random directions, (D d).w must equal d.(D^T w). The derivative
+D d comes from a complex step, f(x + i h d) = f(x) + i h D d + O(h^2), which has no cancellation, so
+that both sides agree to rounding. The *complex-step* test does the same for the whole chain from
+design to distance. The *Taylor* test needs nothing but values of the objective: what remains of
+them beyond the gradient must fall with the square of the step.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpmopt import mpm
+from mpmopt.actuation import signal, signal_adjoint
+from mpmopt.design import DesignChain
+from mpmopt.errors import DesignError
+from mpmopt.objective import Objective
+from mpmopt.particles import lay_out
+from mpmopt.problem import Problem
+from mpmopt.scene import Scene, Wall
+from mpmopt.simulate import Simulation, world_of
+
+COMPLEX_STEP = 1e-30
+
+DOT_TOLERANCE = 1e-13
+COMPLEX_TOLERANCE = 1e-10
+ORDER_TOLERANCE = 0.1
+
+Arrays = dict[str, NDArray]
+
+
+def dot_product_mismatch(
+    function: Callable[[Arrays], Arrays],
+    adjoint: Callable[[Arrays, Arrays], Arrays],
+    inputs: Arrays,
+    rng: np.random.Generator,
+) -> float:
+    """Relative difference of (D d).w and d.(D^T w) for random d and w.
+
+    Parameters
+    ----------
+    function : callable
+        From named arrays to named arrays; must accept complex ones.
+    adjoint : callable
+        From the real inputs and the outputs' adjoints w to the adjoint of each input.
+    inputs : dict of arrays
+        Where the derivative is taken.
+    rng : numpy Generator
+
+    Returns
+    -------
+    float
+        abs(difference) over the sum of the magnitudes of both sides' terms by input.
+    """
+    d = {name: rng.standard_normal(value.shape) for name, value in inputs.items()}
+    shifted = {name: value + 1j * COMPLEX_STEP * d[name] for name, value in inputs.items()}
+    derivative = {name: out.imag / COMPLEX_STEP for name, out in function(shifted).items()}
+    w = {name: rng.standard_normal(out.shape) for name, out in derivative.items()}
+    left = sum(np.sum(derivative[name] * w[name]) for name in w)
+    terms = [np.sum(bar * d[name]) for name, bar in adjoint(inputs, w).items()]
+    if len(terms) != len(inputs):
+        raise DesignError(f"the adjoint returned {len(terms)} arrays for {len(inputs)} inputs")
+    return float(abs(left - sum(terms)) / (abs(left) + sum(abs(term) for term in terms)))
+
+
+def kernel_mismatches(scene: Scene, seed: int = 0) -> dict[str, float]:
+    """Dot-product test of every kernel and link of the chain, on a body of the scene in rough motion.
+
+    Parameters
+    ----------
+    scene : Scene
+    seed : int, optional
+        Of the random motion and directions.
+
+    Returns
+    -------
+    dict of str to float
+        Relative mismatch by name; rounding is about 1e-15.
+    """
+    rng = np.random.default_rng(seed)
+    bench = _Bench(scene, rng)
+    tests = {
+        "stress": (bench.stress, bench.stress_adjoint, "old affine_velocity mass la mu signal"),
+        "p2g": (bench.p2g, bench.p2g_adjoint, "position velocity affine mass"),
+        "grid_update": (bench.grid_update, bench.grid_update_adjoint, "grid"),
+        "g2p": (bench.g2p, bench.g2p_adjoint, "position node_velocity"),
+    }
+    result = {
+        name: dot_product_mismatch(
+            function, adjoint, {key: bench.inputs[key] for key in keys.split()}, rng
+        )
+        for name, (function, adjoint, keys) in tests.items()
+    }
+    chain, objective = DesignChain(scene, bench.particles, 2.0), bench.objective
+    result["design"] = dot_product_mismatch(
+        lambda v: dict(zip(("rho", "la", "mu"), chain.material(v["phi"]), strict=True)),
+        lambda v, w: {"phi": chain.pullback(v["phi"], w["rho"], w["la"], w["mu"])},
+        {"phi": rng.uniform(-0.5, 0.5, int(bench.particles.designed.sum()))},
+        rng,
+    )
+    count = len(scene.actuators)
+    if count:
+        result["signal"] = dot_product_mismatch(
+            lambda v: {"s": signal(scene, v["a"], v["theta"], v["b"])},
+            lambda v, w: dict(
+                zip(("a", "theta", "b"), signal_adjoint(scene, v["a"], v["theta"], w["s"]),
+                    strict=True)
+            ),  # fmt: skip
+            {name: rng.uniform(-1.0, 1.0, count) for name in ("a", "theta", "b")},
+            rng,
+        )
+    result["objective"] = dot_product_mismatch(
+        lambda v: {"L": np.array([objective.value(v["state"])])},
+        lambda v, w: {"state": w["L"][0] * objective.seed(v["state"])},
+        {"state": bench.state},
+        rng,
+    )
+    return result
+
+
+class _Bench:
+    """Kernels and their adjoints as functions of named arrays, on a roughly moving body."""
+
+    def __init__(self, scene: Scene, rng: np.random.Generator) -> None:
+        self.particles = lay_out(scene)
+        self.objective = Objective.of(self.particles, scene.direction)
+        count = len(self.particles.position)
+        dx = scene.grid.dx
+        # Fast enough to hit walls and to slide on them, and well deformed, but not inverted.
+        speed = dx / scene.time_step
+        self.state = np.zeros((mpm.STATE_SIZE, count))
+        self.state[0:2] = self.particles.position.T
+        self.state[2:4] = 0.1 * speed * rng.standard_normal((2, count))
+        self.state[4:8] = 0.1 / scene.time_step * rng.uniform(-1.0, 1.0, (4, count))
+        self.state[8:12] = 0.2 * rng.uniform(-1.0, 1.0, (4, count))
+        self.state[[8, 11]] += 1.0
+        self.world = world_of(scene)
+        ones = np.ones(count)
+        vary = rng.uniform(0.1, 1.0, count)
+        sample = Simulation(
+            scene,
+            self.particles,
+            scene.material.density * vary,
+            scene.material.lame_lambda * vary,
+            scene.material.lame_mu * vary[::-1],
+            np.full((scene.steps, len(scene.actuators)), 0.7),
+            self.state,
+        )
+        self.body = sample.body
+        *window, outside = mpm.find_window(self.state, self.world)
+        if outside >= 0:
+            raise DesignError(f"particle {outside} is outside the grid")
+        self.window = tuple(window)
+        self.nodes = window[2] * window[3]
+        grid = np.zeros((self.nodes, mpm.NODE_SIZE))
+        scratch = self._scratch(float)
+        scratch.affine[:] = rng.standard_normal((4, count)) * np.mean(self.body.mass) * speed
+        mpm.p2g(self.state, self.body, self.world, scratch, self.window, grid)
+        self.mass_grid = grid[:, 2].copy()
+        self.inputs: Arrays = {
+            "position": self.state[0:2],
+            "velocity": self.state[2:4],
+            "affine_velocity": self.state[4:8],
+            "old": self.state[8:12],
+            "mass": self.body.mass,
+            "la": self.body.lame_lambda,
+            "mu": self.body.lame_mu,
+            "signal": np.full(len(scene.actuators), 0.7),
+            "affine": scratch.affine.copy(),
+            "grid": grid[:, :3][grid[:, 2] > 0.0],
+            "node_velocity": speed * rng.standard_normal((self.nodes, 2)),
+        }
+        self._ones = ones
+
+    def _scratch(self, dtype: type) -> mpm.Scratch:
+        count = self.state.shape[1]
+        return mpm.Scratch(
+            affine=np.zeros((4, count), dtype),
+            log_J=np.zeros(count, dtype),
+            velocity=np.zeros((self.nodes, 2), dtype),
+            affine_bar=np.zeros((4, count), dtype),
+            velocity_bar=np.zeros((self.nodes, 2), dtype),
+            node_bar=np.zeros((self.nodes, mpm.NODE_SIZE), dtype),
+        )
+
+    def _state(self, v: Arrays, dtype: type) -> NDArray:
+        state = self.state.astype(dtype)
+        for name, rows in (
+            ("position", slice(0, 2)),
+            ("velocity", slice(2, 4)),
+            ("affine_velocity", slice(4, 8)),
+            ("old", slice(8, 12)),
+        ):
+            if name in v:
+                state[rows] = v[name]
+        return state
+
+    def _body(self, v: Arrays, dtype: type) -> mpm.Body:
+        named = {"mass": "mass", "la": "lame_lambda", "mu": "lame_mu"}
+        arrays = {full: v[short] for short, full in named.items() if short in v}
+        body = self.body._replace(**arrays)
+        floats = ("volume", "mass", "lame_lambda", "lame_mu")
+        return body._replace(**{name: getattr(body, name).astype(dtype) for name in floats})
+
+    def _body_bar(self) -> mpm.BodyBar:
+        return mpm.BodyBar(*(0.0 * self._ones for _ in mpm.BodyBar._fields))
+
+    def stress(self, v: Arrays) -> Arrays:
+        dtype = np.result_type(*v.values()).type
+        old, scratch = self._state(v, dtype), self._scratch(dtype)
+        new = old.copy()
+        mpm.stress(old, new, self._body(v, dtype), self.world, v["signal"], scratch)
+        return {"new": new[8:12], "affine": scratch.affine}
+
+    def stress_adjoint(self, v: Arrays, w: Arrays) -> Arrays:
+        old, scratch, body = self._state(v, float), self._scratch(float), self._body(v, float)
+        new, bar, body_bar = old.copy(), np.zeros_like(old), self._body_bar()
+        signal_bar = np.zeros_like(v["signal"])
+        mpm.stress(old, new, body, self.world, v["signal"], scratch)
+        scratch.affine_bar[:] = w["affine"]
+        bar[8:12] = w["new"]
+        mpm.stress_adjoint(
+            old, new, body, self.world, v["signal"], scratch, bar, body_bar, signal_bar
+        )
+        return {
+            "old": bar[8:12],
+            "affine_velocity": bar[4:8],
+            "mass": body_bar.mass,
+            "la": body_bar.lame_lambda,
+            "mu": body_bar.lame_mu,
+            "signal": signal_bar,
+        }
+
+    def p2g(self, v: Arrays) -> Arrays:
+        dtype = np.result_type(*v.values()).type
+        scratch, grid = self._scratch(dtype), np.zeros((self.nodes, mpm.NODE_SIZE), dtype)
+        scratch.affine[:] = v["affine"]
+        state, body = self._state(v, dtype), self._body(v, dtype)
+        mpm.p2g(state, body, self.world, scratch, self.window, grid)
+        return {"grid": grid[:, :3]}
+
+    def p2g_adjoint(self, v: Arrays, w: Arrays) -> Arrays:
+        scratch, body_bar = self._scratch(float), self._body_bar()
+        bar = np.zeros_like(self.state)
+        scratch.affine[:] = v["affine"]
+        scratch.node_bar[:, :3] = w["grid"]
+        state, body = self._state(v, float), self._body(v, float)
+        mpm.p2g_adjoint(state, body, self.world, scratch, self.window, bar, body_bar)
+        return {
+            "position": bar[0:2],
+            "velocity": bar[2:4],
+            "affine": scratch.affine_bar,
+            "mass": body_bar.mass,
+        }
+
+    def _grid(self, v: Arrays, dtype: type) -> NDArray:
+        grid = np.zeros((self.nodes, mpm.NODE_SIZE), dtype)
+        grid[self.mass_grid > 0.0, :3] = v["grid"]
+        return grid
+
+    def grid_update(self, v: Arrays) -> Arrays:
+        dtype = np.result_type(*v.values()).type
+        scratch = self._scratch(dtype)
+        mpm.grid_update(self._grid(v, dtype), self.window, self.world, scratch)
+        return {"velocity": scratch.velocity}
+
+    def grid_update_adjoint(self, v: Arrays, w: Arrays) -> Arrays:
+        scratch = self._scratch(float)
+        scratch.velocity_bar[:] = w["velocity"]
+        mpm.grid_update_adjoint(self._grid(v, float), self.window, self.world, scratch)
+        return {"grid": scratch.node_bar[:, :3][self.mass_grid > 0.0]}
+
+    def g2p(self, v: Arrays) -> Arrays:
+        dtype = np.result_type(*v.values()).type
+        old, scratch = self._state(v, dtype), self._scratch(dtype)
+        new = np.zeros_like(old)
+        scratch.velocity[:] = v["node_velocity"]
+        mpm.g2p(old, new, self.world, scratch, self.window)
+        return {"new": new[0:8]}
+
+    def g2p_adjoint(self, v: Arrays, w: Arrays) -> Arrays:
+        old, scratch = self._state(v, float), self._scratch(float)
+        new, bar = np.zeros_like(old), np.zeros_like(old)
+        scratch.velocity[:] = v["node_velocity"]
+        mpm.g2p(old, new, self.world, scratch, self.window)
+        bar[0:8] = w["new"]
+        mpm.g2p_adjoint(old, new, self.world, scratch, self.window, bar)
+        return {"position": bar[0:2], "node_velocity": scratch.velocity_bar}
+
+
+def complex_step_errors(
+    problem: Problem, x: NDArray[np.float64], directions: int = 2, seed: int = 0
+) -> dict[str, float]:
+    """Relative error of the gradient along directions, against the complex step.
+
+    Parameters
+    ----------
+    problem : Problem
+    x : (n,) array
+        Design variables.
+    directions : int, optional
+        Random directions of phi; each of a, theta, b of every actuator is checked besides.
+    seed : int, optional
+        Of the random directions.
+
+    Returns
+    -------
+    dict of str to float
+        abs(complex step - gradient.d) / abs(complex step), by the name of the direction.
+    """
+    rng = np.random.default_rng(seed)
+    _, gradient = problem.value_and_gradient(x)
+    parts = problem.split(np.arange(x.size) / x.size)
+    vectors = {}
+    for number in range(directions if parts.phi.size else 0):
+        d = np.zeros(x.size)
+        d[: parts.phi.size] = rng.standard_normal(parts.phi.size)
+        vectors[f"phi along direction {number}"] = d
+    for name in ("a", "theta", "b"):
+        for k, index in enumerate(np.rint(getattr(parts, name) * x.size).astype(int)):
+            d = np.zeros(x.size)
+            d[index] = 1.0
+            vectors[f"{name} of actuator {k}"] = d
+    errors = {}
+    for name, d in vectors.items():
+        exact = problem.value(x + 1j * COMPLEX_STEP * d).imag / COMPLEX_STEP
+        errors[name] = float(abs(exact - gradient @ d) / abs(exact)) if exact else float(
+            abs(gradient @ d)
+        )
+    return errors
+
+
+class Taylor(NamedTuple):
+    """Taylor test: remainders of a first-order expansion.
+
+    Attributes
+    ----------
+    step : (k,) array
+        Steps along the direction, each half of the one before.
+    remainder : (k,) array
+        abs(L(x + step d) - L(x) - step gradient.d).
+    order : (k - 1,) array
+        log2 of the ratio of successive remainders; 2 if the gradient is right.
+    """
+
+    step: NDArray[np.float64]
+    remainder: NDArray[np.float64]
+    order: NDArray[np.float64]
+
+
+def taylor_test(
+    problem: Problem,
+    x: NDArray[np.float64],
+    direction: NDArray[np.float64],
+    steps: NDArray[np.float64] | None = None,
+) -> Taylor:
+    """Remainders of the objective's first-order expansion at x.
+
+    Where contact branches switch within a step the objective is not smooth and the order is lost;
+    `contact_free` makes a window in which it holds.
+
+    Parameters
+    ----------
+    problem : Problem
+    x, direction : (n,) arrays
+        x + step direction must stay within [-1, 1].
+    steps : (k,) array, optional
+        Default: 1/128 to 1/2048, for a direction whose entries are about one.
+    """
+    if steps is None:
+        steps = 0.5 ** np.arange(7, 12)
+    value, gradient = problem.value_and_gradient(x)
+    slope = gradient @ direction
+    remainder = np.array([
+        abs(problem.value(x + step * direction) - value - step * slope) for step in steps
+    ])  # fmt: skip
+    order = np.log2(remainder[:-1] / remainder[1:]) / np.log2(steps[:-1] / steps[1:])
+    return Taylor(np.asarray(steps), remainder, order)
+
+
+def contact_free(scene: Scene, steps: int = 200) -> Scene:
+    """The first steps of a scene without its walls and gravity, so that nothing is ever touched."""
+    no_walls: tuple[Wall, ...] = ()
+    return dataclasses.replace(
+        scene, steps=min(steps, scene.steps), walls=no_walls, gravity=(0.0, 0.0)
+    )
+
+
+class Check(NamedTuple):
+    """One line of `report`."""
+
+    name: str
+    value: float
+    wanted: str
+    passed: bool
+
+
+def report(problem: Problem, x: NDArray[np.float64], seed: int = 0) -> list[Check]:
+    """All three tests on a design: each kernel, the whole gradient, and the Taylor order.
+
+    Parameters
+    ----------
+    problem : Problem
+    x : (n,) array
+        Design variables. The Taylor test, which needs room on both sides, starts from x / 2 with
+        the projection at beta = 1.
+    seed : int, optional
+    """
+    checks = [
+        Check(f"dot product: {name}", error, f"<= {DOT_TOLERANCE:g}", error <= DOT_TOLERANCE)
+        for name, error in kernel_mismatches(problem.scene, seed).items()
+    ]
+    checks += [
+        Check(f"complex step: {name}", error, f"<= {COMPLEX_TOLERANCE:g}",
+              error <= COMPLEX_TOLERANCE)
+        for name, error in complex_step_errors(problem, x, seed=seed).items()
+    ]  # fmt: skip
+    free = Problem(contact_free(problem.scene), checkpointing=problem.checkpointing)
+    direction = np.random.default_rng(seed).uniform(-1.0, 1.0, x.size)
+    for order in taylor_test(free, x / 2.0, direction).order:
+        passed = abs(order - 2.0) <= ORDER_TOLERANCE
+        checks.append(
+            Check("Taylor order, contact-free", float(order), f"2 +- {ORDER_TOLERANCE:g}", passed)
+        )
+    return checks

@@ -1,0 +1,218 @@
+"""Kernels: identities of one step. All of these also run with the JIT switched off."""
+
+import math
+
+import numpy as np
+import pytest
+from conftest import small_scene
+
+from mpmopt import mpm
+from mpmopt.particles import lay_out
+from mpmopt.scene import Solid, Wall
+from mpmopt.simulate import Simulation, world_of
+from mpmopt.verify import DOT_TOLERANCE, kernel_mismatches
+
+
+def one_step(scene, state, signal=0.0, dtype=float):
+    """Advance a state by one step; new state, nodes and window."""
+    particles = lay_out(scene)
+    ones = np.ones(len(particles.position), dtype)
+    simulation = Simulation(
+        scene, particles, ones, 10.0 * ones, 10.0 * ones,
+        np.full((scene.steps, len(scene.actuators)), signal), state,
+    )  # fmt: skip
+    count, nodes = state.shape[1], 400
+    states = np.zeros((2, *state.shape), dtype)
+    states[0] = state
+    grids = np.zeros((1, nodes, mpm.NODE_SIZE), dtype)
+    windows = np.zeros((1, 4), np.int64)
+    scratch = mpm.Scratch(
+        np.zeros((4, count), dtype), np.zeros(count, dtype), np.zeros((nodes, 2), dtype),
+        np.zeros((4, count), dtype), np.zeros((nodes, 2), dtype), np.zeros((nodes, 4), dtype),
+    )  # fmt: skip
+    reached, end, particle = mpm.advance(
+        states, grids, windows, 0, 1, simulation.body, simulation.world, simulation.signal, scratch
+    )
+    assert (reached, end, particle) == (1, mpm.DONE, -1)
+    return states[1], grids[0], windows[0], scratch
+
+
+@pytest.fixture
+def free():
+    """A scene with nothing to touch and no gravity."""
+    return small_scene(walls=(), gravity=(0.0, 0.0))
+
+
+@pytest.fixture
+def state(free, rng):
+    """A rough state of all its particles."""
+    position = lay_out(free).position.T
+    state = np.zeros((12, position.shape[1]))
+    state[0:2] = position
+    state[2:4] = rng.standard_normal(position.shape)
+    state[4:8] = 10.0 * rng.standard_normal((4, position.shape[1]))
+    state[8:12] = 0.1 * rng.standard_normal((4, position.shape[1]))
+    state[[8, 11]] += 1.0
+    return state
+
+
+@pytest.mark.parametrize("x", [0.5, 0.51, 0.75, 1.0, 1.3, 1.4999])
+def test_weights_interpolate_linear_fields_and_know_the_second_moment(x):
+    dx = 0.1
+    base, w, d = mpm.weights((3 + x) * dx, dx)
+    assert base == 3
+    assert sum(w) == pytest.approx(1.0, abs=1e-15)
+    assert sum(a * b for a, b in zip(w, d, strict=True)) == pytest.approx(0.0, abs=1e-16)
+    moment = sum(a * b**2 for a, b in zip(w, d, strict=True))
+    assert moment == pytest.approx(dx**2 / 4, rel=1e-13)  # why C' is scaled by 4 / dx^2
+
+
+def test_weight_slopes_are_the_derivatives_of_the_weights():
+    h = 1e-30
+    for x in (0.31, 0.36, 0.444):
+        _, w, _ = mpm.weights(x + 1j * h, 0.1)
+        slopes = mpm.weight_slopes(x, 0.1)
+        assert [a.imag / h for a in w] == pytest.approx(slopes, rel=1e-13)
+
+
+def test_a_step_conserves_mass_momentum_and_angular_momentum(free, state):
+    new, grid, window, _ = one_step(free, state, signal=1.5)
+    m = lay_out(free).volume
+    dx = free.grid.dx
+
+    def momenta(s):
+        # APIC's angular momentum counts the particles' own spin, m dx^2 / 4 (C10 - C01).
+        spin = dx**2 / 4 * (s[6] - s[5])
+        return (m * s[2:4]).sum(axis=1), (m * (s[0] * s[3] - s[1] * s[2] + spin)).sum()
+
+    scale = np.abs(m * state[2:4]).sum()
+    assert grid[:, 2].sum() == pytest.approx(m.sum(), rel=1e-14)
+    assert grid[:, 0].sum() == pytest.approx(momenta(state)[0][0], abs=1e-14 * scale)
+    assert momenta(new)[0] == pytest.approx(momenta(state)[0], abs=1e-14 * scale)
+    assert momenta(new)[1] == pytest.approx(momenta(state)[1], abs=1e-14 * scale)
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.3, 2.0])
+def test_rigid_rotation_and_translation_are_stress_free(free, state, angle):
+    c, s = math.cos(angle), math.sin(angle)
+    state[2:4] = np.array([[0.3], [-0.2]])
+    state[4:8] = 0.0
+    state[8:12] = np.array([[c], [-s], [s], [c]])
+    new, _, _, scratch = one_step(free, state)
+    # A = -dt V (4/dx^2) tau; the terms that cancel in tau are about mu = 10.
+    impulse = free.time_step * lay_out(free).volume.max() * 4 / free.grid.dx**2
+    assert np.abs(scratch.affine).max() <= 1e-14 * 10.0 * impulse
+    assert new[2:4] == pytest.approx(state[2:4], abs=1e-14)
+    assert new[0:2] - state[0:2] == pytest.approx(free.time_step * state[2:4], abs=1e-14)
+
+
+def test_linear_velocity_fields_pass_the_grid_unchanged(free, state, rng):
+    # With v = v0 + L x and no stress, C' = L and v' = v: the affine transfer is exact.
+    L = rng.standard_normal((2, 2))
+    state[2:4] = L @ state[0:2]
+    state[4:8] = L.reshape(4, 1)
+    # F' = (I + dt L) F = I
+    state[8:12] = np.linalg.inv(np.eye(2) + free.time_step * L).reshape(4, 1)
+    new, *_ = one_step(free, state)
+    assert new[2:4] == pytest.approx(state[2:4], abs=1e-12)
+    assert new[4:8] == pytest.approx(state[4:8], abs=1e-11)
+
+
+def test_small_strain_gives_linear_elasticity(free, state, rng):
+    strain = 1e-7 * rng.standard_normal((2, 2))
+    strain = strain + strain.T
+    state[2:8] = 0.0
+    state[8:12] = (np.eye(2) + strain).reshape(4, 1)
+    *_, scratch = one_step(free, state)
+    impulse = free.time_step * lay_out(free).volume[0] * 4 / free.grid.dx**2
+    tau = -scratch.affine[:, 0].reshape(2, 2) / impulse
+    assert tau == pytest.approx(20.0 * strain + 10.0 * np.trace(strain) * np.eye(2), rel=1e-5)
+
+
+def test_actuation_adds_F_S_F_transposed(free, state):
+    *_, rest = one_step(free, state, signal=0.0)
+    new, _, _, squeezed = one_step(free, state, signal=1.5)
+    particles = lay_out(free)
+    impulse = free.time_step * particles.volume[0] * 4 / free.grid.dx**2
+    difference = -(squeezed.affine - rest.affine).T.reshape(-1, 2, 2) / impulse
+    F = new[8:12].T.reshape(-1, 2, 2)
+    S = np.zeros_like(F)
+    for k, actuator in enumerate(free.actuators):
+        S[particles.actuator == k] = actuator.stress
+    assert difference == pytest.approx(1.5 * F @ S @ F.transpose(0, 2, 1), abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("wall", "before", "after"),
+    [
+        # approaching a floor: sticks, slides freely, or slides with Coulomb's friction
+        (Wall("y", 0.25), (2.0, -1.0), (0.0, 0.0)),
+        (Wall("y", 0.25, friction=0.0), (2.0, -1.0), (2.0, 0.0)),
+        (Wall("y", 0.25, friction=0.5), (2.0, -1.0), (1.5, 0.0)),
+        (Wall("y", 0.25, friction=0.5), (-2.0, -1.0), (-1.5, 0.0)),
+        (Wall("y", 0.25, friction=3.0), (2.0, -1.0), (0.0, 0.0)),
+        # leaving it: free
+        (Wall("y", 0.25), (2.0, 1.0), (2.0, 1.0)),
+        (Wall("y", 0.25, friction=0.5), (2.0, 0.0), (2.0, 0.0)),
+        # ceiling and side walls
+        (Wall("y", 0.125, "above"), (2.0, 1.0), (0.0, 0.0)),
+        (Wall("y", 0.125, "above"), (2.0, -1.0), (2.0, -1.0)),
+        (Wall("x", 0.25, friction=0.5), (-1.0, 2.0), (0.0, 1.5)),
+        (Wall("x", 0.125, "above", friction=0.5), (1.0, -2.0), (0.0, -1.5)),
+    ],
+)
+def test_wall_law(wall, before, after):
+    assert mpm.wall(3, 3, *before, world_with(wall)) == pytest.approx(after)
+
+
+def world_with(wall):
+    """The world of a scene with one wall and a body out of its way."""
+    size = 1 / 16
+    low = 0.75 if wall.solid_side == "below" else size
+    where = (low, 0.5) if wall.axis == "x" else (0.5, low)
+    body = (Solid(where, (where[0] + size, where[1] + size)),)
+    return world_of(small_scene(walls=(wall,), body=body))
+
+
+def test_wall_clamps_the_nodes_strictly_behind_it():
+    for wall, behind, before_it in (
+        (Wall("y", 0.25), 3, 4),
+        (Wall("y", 0.26), 4, 5),
+        (Wall("y", 0.25, "above"), 5, 4),
+        (Wall("y", 0.24, "above"), 4, 3),
+    ):
+        world = world_with(wall)
+        into = -1.0 if wall.solid_side == "below" else 1.0
+        assert mpm.wall(7, behind, 0.0, into, world)[1] == 0.0
+        assert mpm.wall(7, before_it, 0.0, into, world)[1] == into
+
+
+def test_window_is_the_smallest_that_holds_all_touched_nodes(free, state):
+    new, grid, (i0, j0, ni, nj), _ = one_step(free, state)
+    mass = grid[: ni * nj, 2].reshape(ni, nj)
+    assert (i0, j0) == (2, 3)
+    for edge in (mass[0], mass[-1], mass[:, 0], mass[:, -1]):
+        assert edge.max() > 0.0
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, -0.1, 0.03, 0.97, 1e300])
+def test_a_particle_off_the_grid_is_found_before_anything_is_written(free, state, bad):
+    for axis in (0, 1):
+        broken = state.copy()
+        broken[axis, 5] = bad
+        assert mpm.find_window(broken, world_of(free))[4] == 5
+
+
+def test_complex_kernels_have_the_same_real_part(free, state):
+    real, *_ = one_step(free, state, signal=0.5)
+    both, *_ = one_step(free, state + 1e-30j, signal=0.5, dtype=complex)
+    assert both.real == pytest.approx(real, abs=1e-15, rel=1e-14)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_every_adjoint_is_the_transpose_of_its_kernel(seed):
+    mismatches = kernel_mismatches(small_scene(), seed)
+    assert set(mismatches) == {
+        "stress", "p2g", "grid_update", "g2p", "design", "signal", "objective"
+    }  # fmt: skip
+    assert max(mismatches.values()) <= DOT_TOLERANCE
