@@ -1,0 +1,247 @@
+"""Laws of motion over many steps, and an exact solution."""
+
+import math
+
+import numpy as np
+import pytest
+
+from mpmopt import mpm
+from mpmopt.particles import Particles, lay_out
+from mpmopt.scene import Grid, Material, Scene, Solid, Wall
+from mpmopt.simulate import Simulation, world_of
+
+
+def solid_simulation(scene, particles=None, state=None):
+    particles = particles or lay_out(scene)
+    ones = np.ones(len(particles.position))
+    material = scene.material
+    signal = np.zeros((scene.steps, len(scene.actuators)))
+    return Simulation(
+        scene, particles, material.density * ones, material.lame_lambda * ones,
+        material.lame_mu * ones, signal, state,
+    )  # fmt: skip
+
+
+def at_rest(particles):
+    state = np.zeros((12, len(particles.position)))
+    state[0:2] = particles.position.T
+    state[[8, 11]] = 1.0
+    return state
+
+
+def energy(scene, m, V, state):
+    """Kinetic (with the affine part) and stored neo-Hookean energy."""
+    inertia = scene.grid.dx**2 / 4
+    kinetic = 0.5 * (m * ((state[2:4] ** 2).sum(axis=0) + inertia * (state[4:8] ** 2).sum(axis=0)))
+    J = state[8] * state[11] - state[9] * state[10]
+    material = scene.material
+    stored = V * (
+        material.lame_mu / 2 * ((state[8:12] ** 2).sum(axis=0) - 2)
+        - material.lame_mu * np.log(J)
+        + material.lame_lambda / 2 * np.log(J) ** 2
+    )
+    return kinetic.sum(), stored.sum()
+
+
+def test_spinning_disc_keeps_momentum_and_angular_momentum():
+    n, radius, omega = 64, 0.15, 10.0
+    dx = 1 / n
+    scene = Scene(
+        Grid((n, n), dx), time_step=2e-4, steps=5000,
+        body=(Solid((0.25, 0.25), (0.75, 0.75)),),
+    )  # fmt: skip
+    everything = lay_out(scene)
+    arm = everything.position - 0.5
+    disc = everything.subset(np.hypot(*arm.T) < radius)
+    state = at_rest(disc)
+    arm = disc.position.T - 0.5
+    state[2], state[3] = -omega * arm[1], omega * arm[0]
+    state[5], state[6] = -omega, omega
+    m = disc.volume
+    states = solid_simulation(scene, disc, state).run([0, 2500, 5000])
+
+    def angular(s):
+        return (m * (s[0] * s[3] - s[1] * s[2] + dx**2 / 4 * (s[6] - s[5]))).sum()
+
+    for later in states[1:]:
+        assert angular(later) == pytest.approx(angular(states[0]), rel=1e-13)
+        assert np.abs((m * later[2:4]).sum(axis=1)).max() <= 1e-14
+    kinetic = [sum(energy(scene, m, disc.volume, s)) for s in states]
+    assert 0.98 <= kinetic[-1] / kinetic[0] <= 1.0
+
+
+def test_free_fall_is_exact():
+    # Constant acceleration: x_n = x_0 + g dt^2 n (n + 1) / 2 for a symplectic step.
+    scene = Scene(
+        Grid((32, 32), 1 / 32), time_step=2e-3, steps=100, gravity=(1.0, -10.0),
+        body=(Solid((0.25, 0.625), (0.5, 0.75)),),
+    )  # fmt: skip
+    simulation = solid_simulation(scene)
+    end = simulation.run()
+    fall = scene.time_step**2 * 100 * 101 / 2
+    moved = end[0:2] - simulation.initial[0:2]
+    assert moved == pytest.approx(fall * np.array([[1.0], [-10.0]]) * np.ones_like(moved))
+    assert end[8:12] == pytest.approx(np.array([[1], [0], [0], [1]]) * np.ones(end.shape[1]))
+
+
+def test_self_weight_column_carries_what_lies_above():
+    # Without lateral stress (lambda = 0) the strain is uniaxial, and at rest the first
+    # Piola-Kirchhoff stress is P_yy(Y) = -rho g (l0 - Y) whatever the law.
+    n, g, length, mu = 32, 1.0, 0.5, 10.0
+    dx = 1 / n
+    scene = Scene(
+        Grid((n, n), dx), time_step=2e-3, steps=20000, gravity=(0.0, -g),
+        material=Material(lame_lambda=0.0, lame_mu=mu),
+        body=(Solid((0.25, 0.125), (0.375, 0.125 + length)),),
+        walls=(Wall("y", 0.125, friction=0.0),),
+    )  # fmt: skip
+    particles = lay_out(scene)
+    end = solid_simulation(scene, particles).run()
+    height = particles.position[:, 1] - 0.125
+    excess = -mu * (end[11] ** 2 - 1.0) / end[11] - g * (length - height)
+    # Means over rows of cells: the two particles in a cell's column share what its nodes resolve.
+    row = (height / dx).astype(int)
+    mean = np.bincount(row, excess) / np.bincount(row)
+    assert np.abs(mean[6:]).max() <= 0.02 * g * length  # below, contact is smeared over kernels
+    assert np.abs(end[2:4]).max() <= 1e-3 * math.sqrt(2 * g * length)
+
+
+def test_a_dropped_block_rests_above_the_floor():
+    # Nodes j < 3 are clamped. Contact begins when the lowest particles' kernels reach row 2, at
+    # 3.5 dx, and the block rests near 3.1 dx.
+    n = 32
+    dx = 1 / n
+    scene = Scene(
+        Grid((n, n), dx), time_step=2e-3, steps=15000, gravity=(0.0, -1.0),
+        body=(Solid((8 * dx, 4 * dx), (16 * dx, 10 * dx)),), walls=(Wall("y", 3 * dx),),
+    )  # fmt: skip
+    simulation = solid_simulation(scene)
+    states = simulation.run(range(0, 200, 1))
+    lowest = states[:, 1].min(axis=1) / dx
+    fall = scene.time_step**2 / dx * np.arange(200) * (np.arange(200) + 1) / 2
+    free = np.abs(lowest - (4.25 - fall)) < 1e-9
+    assert 3.45 <= lowest[free].min() <= 3.55
+    end = simulation.run()
+    assert 2.9 <= end[1].min() / dx <= 3.3
+    assert np.abs(end[2:4]).max() <= 0.01
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.2])
+def test_a_sliding_block_loses_friction_times_the_normal_impulse(friction):
+    # While every touched node slides, Coulomb's law is exact step by step:
+    # change of p_x = -mu_f (change of p_y + m g t).
+    n, g = 32, 2.0
+    dx = 1 / n
+    scene = Scene(
+        Grid((2 * n, n), dx), time_step=2e-3, steps=400, gravity=(0.0, -g),
+        body=(Solid((8 * dx, 3 * dx), (16 * dx, 7 * dx)),),
+        walls=(Wall("y", 3 * dx, friction=friction),),
+    )  # fmt: skip
+    particles = lay_out(scene)
+    state = at_rest(particles)
+    state[2] = 1.0
+    end = solid_simulation(scene, particles, state).run()
+    m = particles.volume
+    lost, (_, rise) = (m * state[2]).sum() - (m * end[2]).sum(), (m * end[2:4]).sum(axis=1)
+    normal_impulse = rise + m.sum() * g * scene.duration
+    assert normal_impulse >= 0.8 * m.sum() * g * scene.duration
+    assert lost == pytest.approx(friction * normal_impulse, rel=1e-10, abs=1e-14)
+
+
+def manufactured_error(n, amplitude, courant=0.2, per_cell=2):
+    """Greatest rms error over half a period, in amplitudes, of the axis-aligned manufactured solution.
+
+    u_i = A sin(pi X_i) sin(c pi t + phi_i) on the unit square between mirror walls, which fold what
+    particles put on the ghost nodes back to the inside.
+    """
+    E, nu = 1e4, 0.3
+    la, mu = E * nu / ((1 + nu) * (1 - 2 * nu)), E / (2 * (1 + nu))
+    c = math.sqrt(E)
+    phase = np.array([[0.0], [math.pi]])
+    dx = 1.0 / n
+    offset = 3 * dx  # room for the ghost nodes
+    material = Material(lame_lambda=la, lame_mu=mu)
+    steps = math.ceil(1.0 / c / (courant * dx / material.wave_speed))
+    dt = 1.0 / c / steps
+    scene = Scene(
+        Grid((n + 6, n + 6), dx), time_step=dt, steps=steps, material=material,
+        body=(Solid((offset, offset), (1 + offset, 1 + offset)),), particles_per_cell=per_cell,
+    )  # fmt: skip
+    particles = lay_out(scene)
+    simulation = solid_simulation(scene, particles)
+    body, world = simulation.body, world_of(scene)
+    X = particles.position.T - offset
+    sine, cosine = np.sin(np.pi * X), np.cos(np.pi * X)
+
+    def exact(t):
+        u = amplitude * sine * np.sin(c * np.pi * t + phase)
+        slope = amplitude * np.pi * cosine * np.sin(c * np.pi * t + phase)
+        return u, 1.0 + slope
+
+    def force(t):
+        u, F = exact(t)
+        J = F[0] * F[1]
+        return np.pi**2 * u * (mu - c**2 - (la * (np.log(J) - 1.0) - mu) / F**2)
+
+    old = at_rest(particles)
+    rate = c * np.pi * np.cos(phase)
+    old[2:4] = amplitude * sine * rate
+    old[4], old[7] = amplitude * np.pi * cosine * rate
+    old[8], old[11] = 1.0 / (1.0 + dt * old[4]), 1.0 / (1.0 + dt * old[7])
+    new = old.copy()
+    side, count = n + 7, X.shape[1]
+    window = (0, 0, side, side)
+    grid = np.zeros((side * side, mpm.NODE_SIZE))
+    scratch = mpm.Scratch(
+        np.zeros((4, count)), np.zeros(count), np.zeros((side * side, 2)),
+        np.zeros((4, count)), np.zeros((side * side, 2)), grid.copy(),
+    )  # fmt: skip
+    worst = 0.0
+    for step in range(steps):
+        old[2:4] += dt * force(step * dt)
+        mpm.stress(old, new, body, world, np.zeros(0), scratch)
+        mpm.p2g(old, body, world, scratch, window, grid)
+        mirror(grid.reshape(side, side, 4), 0, n)
+        mirror(grid.reshape(side, side, 4).transpose(1, 0, 2), 1, n)
+        mpm.grid_update(grid, window, world, scratch)
+        mpm.g2p(old, new, world, scratch, window)
+        old, new = new, old
+        u, _ = exact((step + 1) * dt)
+        error = old[0:2] - offset - X - u
+        worst = max(worst, math.sqrt((error**2).sum(axis=0).mean()) / amplitude)
+    return worst
+
+
+def mirror(nodes, normal, n):
+    """Make momentum and mass symmetric about node rows 3 and 3 + n of the first axis."""
+    for row, inward in ((3, 1), (3 + n, -1)):
+        for k in (1, 2):
+            inside, ghost = nodes[row + k * inward], nodes[row - k * inward]
+            reflected = ghost.copy()
+            reflected[:, normal] *= -1.0
+            inside += reflected
+            ghost[:] = inside
+            ghost[:, normal] *= -1.0
+        nodes[row, :, normal] = 0.0
+        nodes[row, :, 1 - normal] *= 2.0
+        nodes[row, :, 2] *= 2.0
+
+
+def test_manufactured_solution_converges_with_order_two():
+    errors = np.array([manufactured_error(n, 1e-3) for n in (8, 16, 32)])
+    order = np.log2(errors[:-1] / errors[1:])
+    assert order.min() >= 1.9
+    assert np.all(errors <= 1.15 * np.array([3.61e-2, 8.98e-3, 2.24e-3]))
+
+
+def test_particles_of_another_order_give_the_same_motion(rng):
+    scene = Scene(
+        Grid((32, 32), 1 / 32), time_step=2e-3, steps=100, gravity=(0.0, -10.0),
+        body=(Solid((0.25, 0.125), (0.5, 0.25)),), walls=(Wall("y", 0.125),),
+    )  # fmt: skip
+    particles = lay_out(scene)
+    order = rng.permutation(len(particles.position))
+    shuffled = Particles(*(np.ascontiguousarray(a[order]) for a in vars(particles).values()))
+    one = solid_simulation(scene, particles).run()
+    other = solid_simulation(scene, shuffled).run()
+    assert other == pytest.approx(one[:, order], abs=1e-11)
