@@ -179,6 +179,7 @@ class Checkpoints:
         try:
             for name, array in arrays.items():
                 self._file.create_dataset(f"{segment}/{name}", data=array, dtype=array.dtype)
+            self._file.flush()  # an error in writing what HDF5 holds back would pass unseen
         except (OSError, RuntimeError) as error:
             size = sum(array.nbytes for array in arrays.values())
             raise StorageError(
@@ -198,9 +199,18 @@ class Checkpoints:
             ) from error
 
     def close(self) -> None:
-        """Close the store, and remove it unless it is to be kept."""
+        """Close the store, and remove it unless it is to be kept.
+
+        Raises
+        ------
+        StorageError
+            If a file that is to be kept could not be completed.
+        """
         try:
             self._file.close()
+        except (OSError, RuntimeError) as error:
+            if self._keep:
+                raise StorageError(f"cannot complete {self.path}: {error}; make room") from error
         finally:
             if not self._keep:
                 self._remove()
@@ -218,4 +228,8 @@ class Checkpoints:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        self.close()
+        try:
+            self.close()
+        except StorageError:
+            if error is None:
+                raise

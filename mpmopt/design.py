@@ -7,27 +7,9 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from mpmopt.errors import DesignError
-from mpmopt.mpm import weights
+from mpmopt.mpm import interpolation
 from mpmopt.particles import Particles
 from mpmopt.scene import Material, Scene
-
-
-def interpolation_matrix(
-    position: NDArray[np.float64], scene: Scene
-) -> scipy.sparse.csr_array[np.float64]:
-    """Quadratic B-spline weights w_ip (particles, nodes); node (i, j) is column i * (ny + 1) + j."""
-    dx, rows = scene.grid.dx, scene.grid.cells[1] + 1
-    entries, columns = [], []
-    for x, y in position:
-        i, wx, _ = weights(x, dx)
-        j, wy, _ = weights(y, dx)
-        entries.append(np.outer(wx, wy).ravel())
-        columns.append(((i + np.arange(3))[:, None] * rows + j + np.arange(3)).ravel())
-    start = np.arange(0, 9 * len(position) + 1, 9)
-    shape = (len(position), (scene.grid.cells[0] + 1) * rows)
-    return scipy.sparse.csr_array(
-        (np.concatenate(entries), np.concatenate(columns), start), shape=shape
-    )
 
 
 def filter_matrix(scene: Scene, particles: Particles) -> scipy.sparse.csr_array[np.float64]:
@@ -37,25 +19,29 @@ def filter_matrix(scene: Scene, particles: Particles) -> scipy.sparse.csr_array[
     that carry none are left out and the weights that remain are scaled to sum to one, so that a
     constant field stays constant.
     """
-    to_particles = interpolation_matrix(particles.position[particles.designed], scene)
-    used = np.flatnonzero(to_particles.sum(axis=0))
-    to_particles = to_particles[:, used]
+    rows = scene.grid.cells[1] + 1
+    position = particles.position[particles.designed]
+    nodes, values = interpolation(position, scene.grid.dx, rows)
+    carries = values > 0.0
+    used, column = np.unique(nodes[carries], return_inverse=True)
+    to_particles = scipy.sparse.csr_array(
+        (values[carries], (np.nonzero(carries)[0], column)), shape=(len(position), used.size)
+    )
 
     w0, w1, w2 = scene.filter_weights
-    rows = scene.grid.cells[1] + 1
-    entry = np.full((scene.grid.cells[0] + 1) * rows, -1)
-    entry[used] = np.arange(used.size)
-    pairs, values = [], []
+    i, j = np.divmod(used, rows)
+    number = np.full((scene.grid.cells[0] + 3, rows + 2), -1)  # with a margin of empty nodes
+    number[i + 1, j + 1] = np.arange(used.size)
+    pairs, shares = [], []
     for di in (-1, 0, 1):
         for dj in (-1, 0, 1):
-            # Used nodes keep a cell's distance from the grid's edge, so no row wraps round.
-            neighbour = entry[used + di * rows + dj]
+            neighbour = number[i + 1 + di, j + 1 + dj]
             exists = neighbour >= 0
             pairs.append(np.stack([np.flatnonzero(exists), neighbour[exists]]))
-            values.append(np.full(exists.sum(), (w0, w1, w2)[abs(di) + abs(dj)]))
+            shares.append(np.full(exists.sum(), (w0, w1, w2)[abs(di) + abs(dj)]))
     row, column = np.concatenate(pairs, axis=1)
     shape = (used.size, used.size)
-    convolution = scipy.sparse.csr_array((np.concatenate(values), (row, column)), shape=shape)
+    convolution = scipy.sparse.csr_array((np.concatenate(shares), (row, column)), shape=shape)
 
     def normalised(matrix: scipy.sparse.csr_array) -> scipy.sparse.csr_array:
         return scipy.sparse.diags_array(1.0 / matrix.sum(axis=1)) @ matrix

@@ -104,6 +104,21 @@ def weight_slopes(x, dx):
 
 
 @jit
+def interpolation(position, dx, rows):
+    """Nodes and weights (N, 9) of particles at (N, 2); node (i, j) has number i * rows + j."""
+    nodes = np.empty((position.shape[0], 9), np.int64)
+    values = np.empty((position.shape[0], 9))
+    for p in range(position.shape[0]):
+        i, wx, _ = weights(position[p, 0], dx)
+        j, wy, _ = weights(position[p, 1], dx)
+        for a in range(3):
+            for b in range(3):
+                nodes[p, 3 * a + b] = (i + a) * rows + j + b
+                values[p, 3 * a + b] = wx[a] * wy[b]
+    return nodes, values
+
+
+@jit
 def find_window(state, world):
     """Window (i0, j0, ni, nj) of all touched nodes, and the first particle off the grid or -1."""
     lo = 0.5 * world.dx

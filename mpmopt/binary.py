@@ -1,0 +1,80 @@
+"""Bodies without grey: every particle is solid or absent. Post-processing and references."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpmopt.actuation import signal
+from mpmopt.errors import DesignError
+from mpmopt.objective import Objective
+from mpmopt.particles import lay_out
+from mpmopt.problem import Problem, Variables
+from mpmopt.scene import Scene
+from mpmopt.simulate import Simulation
+
+THRESHOLD = 0.3  # of gamma, as in the paper
+
+
+def solid_body(
+    scene: Scene, keep: NDArray[np.bool_], variables: Variables
+) -> tuple[Simulation, Objective]:
+    """The body of which only some design particles are there, all of them solid.
+
+    Parameters
+    ----------
+    scene : Scene
+    keep : (D,) array of bool
+        Design particles that are there; the others are not simulated at all.
+    variables : Variables
+        Its a, theta and b are the actuation.
+
+    Raises
+    ------
+    DesignError
+        If `keep` has another size.
+    """
+    particles = lay_out(scene)
+    designed = int(particles.designed.sum())
+    if np.shape(keep) != (designed,):
+        raise DesignError(f"keep has shape {np.shape(keep)}, the design particles {(designed,)}")
+    there = np.ones(particles.designed.size, dtype=bool)
+    there[particles.designed] = keep
+    particles = particles.subset(there)
+    ones = np.ones(there.sum())
+    material = scene.material
+    simulation = Simulation(
+        scene,
+        particles,
+        density=material.density * ones,
+        lame_lambda=material.lame_lambda * ones,
+        lame_mu=material.lame_mu * ones,
+        signal=signal(scene, variables.a, variables.theta, variables.b),
+    )
+    return simulation, Objective.of(particles, scene.direction)
+
+
+def distance(scene: Scene, keep: NDArray[np.bool_], variables: Variables) -> float:
+    """Objective L of a `solid_body`.
+
+    Raises
+    ------
+    DesignError, SimulationError
+        As the simulation does.
+    """
+    simulation, objective = solid_body(scene, keep, variables)
+    return float(objective.value(simulation.run()))
+
+
+def post_processed(problem: Problem, x: NDArray, threshold: float = THRESHOLD) -> float:
+    """Objective L once particles with gamma >= threshold are solid and the others removed."""
+    return distance(problem.scene, problem.gamma(x) >= threshold, problem.split(x))
+
+
+def full_block(problem: Problem, *designs: NDArray) -> float:
+    """Objective L of the reference: the design domain all solid, with the best actuation of some.
+
+    The simplest body that one would draw. L is the largest over the actuations of `designs`.
+    """
+    keep = np.ones(problem.gamma(designs[0]).size, dtype=bool)
+    return max(distance(problem.scene, keep, problem.split(x)) for x in designs)

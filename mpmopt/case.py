@@ -1,0 +1,202 @@
+"""One case from start to end: optimise, judge, and leave a folder of results."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import os
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from mpmopt import runfile
+from mpmopt.binary import full_block, post_processed
+from mpmopt.checkpoints import Checkpointing
+from mpmopt.errors import MpmoptError, SimulationError, StorageError
+from mpmopt.optimize import Optimisation, Settings, optimise
+from mpmopt.problem import Problem
+from mpmopt.scene import Scene
+
+START = {"phi": 0.0, "a": 1.0, "theta": -0.3, "b": -0.5}
+
+
+@dataclass(frozen=True)
+class Case:
+    """A scene and how to optimise it.
+
+    Attributes
+    ----------
+    scene : Scene
+    settings : Settings
+    """
+
+    scene: Scene
+    settings: Settings
+
+
+class ProgressBar:
+    """Callback of `optimise` that shows objective, beta and greyness; log lines off a terminal."""
+
+    def __init__(self) -> None:
+        self._bar = tqdm(unit=" gradients", disable=not sys.stderr.isatty())
+        self._best: dict[int, float] = {}
+
+    def __call__(self, run: Optimisation) -> None:
+        last = run.history[-1]
+        if run.stop_reason:
+            self._bar.close()
+            return
+        text = f"L {last.objective:.4f}, beta {last.beta:g}, greyness {last.greyness:.3f}"
+        self._bar.set_postfix_str(text, refresh=False)
+        self._bar.update()
+        if self._bar.disable and len(run.history) % 10 == 0:
+            print(f"{len(run.history)} gradients, {last.seconds:.0f} s: {text}", file=sys.stderr)
+
+
+def run(case: Case, out: Path, checkpointing: Checkpointing | None = None) -> dict[str, Any]:
+    """Optimise a case and leave its results in a folder.
+
+    Writes ``run.h5`` (after every evaluation), ``summary.json``, ``design.png`` and
+    ``history.png``.
+
+    Returns
+    -------
+    dict
+        The summary.
+
+    Raises
+    ------
+    StorageError
+        If the folder cannot be made or already holds a run.
+    MpmoptError
+        As `optimise` does.
+    """
+    path = out / "run.h5"
+    if path.exists():
+        raise StorageError(f"{path} holds an earlier run; choose another folder or move it away")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise StorageError(f"cannot make {out}: {error}; choose another folder") from error
+    first = case.settings.stages[0]
+    start = Problem(first.scene(case.scene), first.beta).join(**START)
+    result = optimise(
+        case.scene,
+        case.settings,
+        start,
+        [lambda current: runfile.write(path, current), ProgressBar()],
+        checkpointing,
+    )
+    summary = summarise(result, start)
+    _write_text(out / "summary.json", json.dumps(summary, indent=1) + "\n")
+    _draw(out, result, summary)
+    return summary
+
+
+def summarise(result: Optimisation, start: np.ndarray) -> dict[str, Any]:
+    """Objective values (L, larger is farther), actuation and counts of a finished optimisation."""
+    best = result.result
+    stage = result.settings.stages[best.stage]
+    problem = Problem(stage.scene(result.scene).with_time_step(best.time_step), stage.beta)
+    actuation = problem.split(best.x)
+
+    def numbers(values: np.ndarray) -> float | list[float]:
+        return float(values[0]) if values.size == 1 else values.tolist()
+
+    return {
+        "start": result.history[0].objective,
+        "reference": _value_or_none(lambda: full_block(problem, start, best.x)),
+        "optimised": best.objective,
+        "post_processed": _value_or_none(lambda: post_processed(problem, best.x)),
+        "greyness": best.greyness,
+        "a": numbers(actuation.a),
+        "theta": numbers(actuation.theta),
+        "b": numbers(actuation.b),
+        "evaluations": len(result.history),
+        "failed_evaluations": result.failed_evaluations,
+        "seconds": result.history[-1].seconds,
+        "stop_reason": result.stop_reason,
+    }
+
+
+def _value_or_none(value: Any) -> float | None:
+    try:
+        return float(value())
+    except SimulationError as error:
+        logging.getLogger(__name__).warning("no value: %s", error)
+        return None
+
+
+def _draw(out: Path, result: Optimisation, summary: Mapping[str, Any]) -> None:
+    from mpmopt import plot
+
+    best = result.result
+    stage = result.settings.stages[best.stage]
+    problem = Problem(stage.scene(result.scene).with_time_step(best.time_step), stage.beta)
+    plot.plot_design(
+        out / "design.png", problem, best.x, f"Optimised design, L = {summary['optimised']:.3f}"
+    )
+    plot.plot_history(out / "history.png", result)
+
+
+def _write_text(path: Path, text: str) -> None:
+    """Write a text file that is complete or absent."""
+    new = path.with_name(f".{path.name}-new")
+    try:
+        new.write_text(text)
+        os.replace(new, path)
+    except OSError as error:
+        raise StorageError(f"cannot write {path}: {error}; make room") from error
+
+
+def table(summary: Mapping[str, Any]) -> str:
+    """The summary as aligned text."""
+    width = max(len(name) for name in summary)
+    lines = []
+    for name, value in summary.items():
+        shown = f"{value:.4f}" if isinstance(value, float) else str(value)
+        lines.append(f"{name.replace('_', ' '):<{width}}  {shown}")
+    return "\n".join(lines)
+
+
+def main(description: str, cases: Mapping[str, Case], argv: list[str] | None = None) -> int:
+    """Command line of a case script.
+
+    Parameters
+    ----------
+    description : str
+    cases : mapping of str to Case
+        By setting: "default", and others that become options such as ``--preview``.
+    argv : list of str, optional
+        Default: the command line's.
+
+    Returns
+    -------
+    int
+        Exit code: 0, or 1 with a message on standard error.
+    """
+    parser = argparse.ArgumentParser(description=description)
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of results")
+    choice = parser.add_mutually_exclusive_group()
+    for name, case in cases.items():
+        if name != "default":
+            n, dt = case.scene.grid.cells[0], case.scene.time_step
+            text = f"n = {n}, dt = {dt:g} instead of the default setting"
+            choice.add_argument(
+                f"--{name}", dest="setting", action="store_const", const=name, help=text
+            )
+    arguments = parser.parse_args(argv)
+    logging.basicConfig(format="%(message)s")
+    try:
+        summary = run(cases[arguments.setting or "default"], arguments.out)
+    except MpmoptError as error:
+        print(f"{type(error).__name__}: {error}", file=sys.stderr)
+        return 1
+    print(table(summary))
+    return 0

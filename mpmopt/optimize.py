@@ -1,0 +1,384 @@
+"""From a grey block to a robot: stages of moving asymptotes, each sharper than the last."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpmopt.binary import post_processed
+from mpmopt.checkpoints import Checkpointing
+from mpmopt.design import greyness
+from mpmopt.errors import DesignError, SimulationError
+from mpmopt.mma import MovingAsymptotes
+from mpmopt.problem import Problem
+from mpmopt.scene import Scene
+
+logger = logging.getLogger(__name__)
+
+# Factors on the move limit after a step that went back, and after one that went on.
+SHORTEN, LENGTHEN = 0.6, 1.2
+
+
+@dataclass(frozen=True)
+class Stage:
+    """What one stage of the continuation holds fixed.
+
+    Attributes
+    ----------
+    beta : float
+        Sharpness of the projection.
+    mass_floor, stiffness_floor : float
+        Share of mass and stiffness that void keeps.
+    time_step : float
+    solid : bool
+        Whether the best design is the one that goes farthest once its void is removed
+        (`binary.post_processed`), which costs a forward run more, instead of as it is.
+    """
+
+    beta: float
+    mass_floor: float
+    stiffness_floor: float
+    time_step: float
+    solid: bool = False
+
+    def scene(self, scene: Scene) -> Scene:
+        """The scene as this stage simulates it."""
+        return scene.with_floors(self.mass_floor, self.stiffness_floor).with_time_step(
+            self.time_step
+        )
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How to optimise.
+
+    Attributes
+    ----------
+    stages : tuple of Stage
+    move_limit : float
+        Greatest step of a variable, as a fraction of its range.
+    adapt_move_limit : bool
+        Shorten the move limit after a step that went back, and lengthen it, up to `move_limit`,
+        after one that went on.
+    sharpen_asymptotes : bool
+        Initial asymptotes at 0.5 / (beta + 1) of the range instead of 0.5.
+    best_first : bool
+        Start each stage from the best design of the last, with a fresh asymptote history, instead
+        of going on from the last design.
+    window : int
+        Iterations in the moving average of the stop rule.
+    tolerance : float
+        A stage ends when the moving average changes by no more than this.
+    least_iterations, most_iterations : int
+        Successful evaluations of a stage.
+    most_failures : int
+        Failed evaluations in a row after which the optimisation gives up.
+
+    Raises
+    ------
+    DesignError
+        If there is no stage or a number makes no sense.
+    """
+
+    stages: tuple[Stage, ...]
+    move_limit: float = 0.05
+    adapt_move_limit: bool = True
+    sharpen_asymptotes: bool = True
+    best_first: bool = True
+    window: int = 10
+    tolerance: float = 2e-4
+    least_iterations: int = 20
+    most_iterations: int = 200
+    most_failures: int = 8
+
+    def __post_init__(self) -> None:
+        if not self.stages:
+            raise DesignError("Settings: stages is empty; give at least one")
+        for name in ("window", "least_iterations", "most_iterations", "most_failures"):
+            if not getattr(self, name) >= 1:
+                raise DesignError(f"Settings: {name} = {getattr(self, name)} must be at least 1")
+        if self.least_iterations > self.most_iterations:
+            raise DesignError(
+                f"Settings: least_iterations = {self.least_iterations} is above "
+                f"most_iterations = {self.most_iterations}"
+            )
+        if not 0.0 < self.move_limit <= 1.0:
+            raise DesignError(f"Settings: move_limit = {self.move_limit} must be in (0, 1]")
+        if not self.tolerance >= 0.0:
+            raise DesignError(f"Settings: tolerance = {self.tolerance} must not be negative")
+
+
+@dataclass(frozen=True)
+class Iteration:
+    """One evaluation.
+
+    Attributes
+    ----------
+    stage : int
+        Index of the stage.
+    beta, time_step, move_limit : float
+        In force during the evaluation.
+    x : (n,) array
+        The design that was evaluated.
+    gamma : (D,) array
+        Its material density.
+    objective : float
+        L, or not a number if the evaluation failed.
+    greyness : float
+        Mean of 4 gamma (1 - gamma).
+    projected_gradient : float
+        Greatest change of L per unit of x that the bounds leave free.
+    step : float
+        Greatest change of a variable since the last evaluation, as a fraction of its range.
+    seconds : float
+        Since the optimisation began.
+    post_processed : float
+        L without void, or not a number if the stage does not ask for it or it failed.
+    failure : str
+        Why the evaluation failed, or empty.
+    """
+
+    stage: int
+    beta: float
+    time_step: float
+    move_limit: float
+    x: NDArray[np.float64]
+    gamma: NDArray[np.float64]
+    objective: float
+    greyness: float
+    projected_gradient: float
+    step: float
+    seconds: float
+    post_processed: float = np.nan
+    failure: str = ""
+
+
+@dataclass
+class Optimisation:
+    """An optimisation as it stands: what `optimise` hands to callbacks and returns.
+
+    Attributes
+    ----------
+    scene : Scene
+    settings : Settings
+    history : list of Iteration
+        All evaluations.
+    best : dict of int to Iteration
+        The best evaluation of each stage that had one.
+    stop_reason : str
+        A sentence; empty while it runs.
+    """
+
+    scene: Scene
+    settings: Settings
+    history: list[Iteration] = field(default_factory=list)
+    best: dict[int, Iteration] = field(default_factory=dict)
+    stop_reason: str = ""
+
+    @property
+    def result(self) -> Iteration:
+        """The best evaluation of the last stage that had one.
+
+        Raises
+        ------
+        SimulationError
+            If every evaluation failed.
+        """
+        if not self.best:
+            raise SimulationError(
+                "every evaluation failed", 0, -1, (np.nan, np.nan), "see the history's failures"
+            )
+        return self.best[max(self.best)]
+
+    @property
+    def failed_evaluations(self) -> int:
+        """Number of evaluations that failed."""
+        return sum(bool(iteration.failure) for iteration in self.history)
+
+
+Callback = Callable[[Optimisation], None]
+
+
+def optimise(
+    scene: Scene,
+    settings: Settings,
+    start: NDArray[np.float64],
+    callbacks: Iterable[Callback] = (),
+    checkpointing: Checkpointing | None = None,
+) -> Optimisation:
+    """Maximise the distance travelled, stage by stage.
+
+    An evaluation that fails steps back to the stage's best design and halves the move limit,
+    which then recovers slowly. A stage whose very first design fails takes half its time step.
+
+    Parameters
+    ----------
+    scene : Scene
+    settings : Settings
+    start : (n,) array
+        First design, within [-1, 1] (`Problem.join` makes it).
+    callbacks : iterable of callable
+        Called after each evaluation and once at the end.
+    checkpointing : Checkpointing, optional
+
+    Raises
+    ------
+    DesignError
+        If `start` does not fit the scene.
+    SceneError
+        If a stage cannot be simulated; all are checked before the first evaluation.
+    StorageError
+        If checkpoints cannot be stored.
+    """
+    scenes = [stage.scene(scene) for stage in settings.stages]
+    run = Optimisation(scene, settings)
+    callbacks = tuple(callbacks)
+    began = time.monotonic()
+    x = np.array(start, dtype=float)
+    reason = ""
+    for index, stage in enumerate(settings.stages):
+        stage_run = _StageRun(run, index, stage, scenes[index], checkpointing, callbacks, began)
+        x, reason, gave_up = stage_run.climb(x)
+        logger.info("stage %d (beta %g): %s", index, stage.beta, reason)
+        if gave_up:
+            break
+    run.stop_reason = f"Stage {index + 1} of {len(settings.stages)} was the last: {reason}"
+    for callback in callbacks:
+        callback(run)
+    return run
+
+
+class _StageRun:
+    """One stage on its way."""
+
+    def __init__(
+        self,
+        run: Optimisation,
+        index: int,
+        stage: Stage,
+        scene: Scene,
+        checkpointing: Checkpointing | None,
+        callbacks: Sequence[Callback],
+        began: float,
+    ) -> None:
+        self.run, self.index, self.stage = run, index, stage
+        self.callbacks, self.began = callbacks, began
+        self.checkpointing = checkpointing
+        self.problem = Problem(scene, stage.beta, checkpointing)
+        self.best_merit: tuple[float, ...] | None = None
+        self.best_gradient: NDArray[np.float64] | None = None
+
+    def climb(self, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], str, bool]:
+        """Climb from x to where the stop rule ends the stage.
+
+        Returns the design that the next stage starts from, why it stopped, and whether to give up.
+        """
+        settings = self.run.settings
+        mma = MovingAsymptotes(
+            -np.ones(x.size),
+            np.ones(x.size),
+            move_limit=settings.move_limit,
+            asymptote_initial=0.5 / (self.stage.beta + 1.0) if settings.sharpen_asymptotes else 0.5,
+        )
+        values: list[float] = []
+        failures = 0
+        while True:
+            evaluated = self._evaluate(x, mma.move_limit)
+            if evaluated is None:
+                failures += 1
+                last = self.run.history[-1].failure
+                if failures >= settings.most_failures:
+                    return x, f"it gave up after {failures} failed evaluations in a row, {last}", True
+                best = self.run.best.get(self.index)
+                if best is None or self.best_gradient is None:
+                    self._halve_time_step()
+                    continue
+                mma.reset()
+                mma.move_limit /= 2.0
+                x = mma.step(best.x, -best.objective, -self.best_gradient)
+                continue
+            failures = 0
+            value, gradient = evaluated
+            values.append(value)
+            stop = self._stop_reason(values)
+            if stop:
+                return (self.run.best[self.index].x if settings.best_first else x), stop, False
+            went_back = len(values) > 1 and value < values[-2]
+            factor = SHORTEN if went_back and settings.adapt_move_limit else LENGTHEN
+            mma.move_limit = min(settings.move_limit, factor * mma.move_limit)
+            x = mma.step(x, -value, -gradient)
+
+    def _evaluate(
+        self, x: NDArray[np.float64], move_limit: float
+    ) -> tuple[float, NDArray[np.float64]] | None:
+        """Value and gradient, recorded; None if the simulation failed."""
+        run = self.run
+        value, gradient, failure = np.nan, np.full(x.size, np.nan), ""
+        try:
+            value, gradient = self.problem.value_and_gradient(x)
+        except SimulationError as error:
+            failure = str(error)
+            logger.warning("evaluation %d failed: %s", len(run.history), error)
+        solid = self._without_void(x) if self.stage.solid and not failure else np.nan
+        before = run.history[-1].x if run.history else x
+        free = np.where(gradient > 0.0, x < 1.0, x > -1.0)
+        gamma = self.problem.gamma(x)
+        iteration = Iteration(
+            stage=self.index,
+            beta=self.stage.beta,
+            time_step=self.problem.scene.time_step,
+            move_limit=move_limit,
+            x=x.copy(),
+            gamma=gamma,
+            objective=value,
+            greyness=greyness(gamma),
+            projected_gradient=float(np.abs(gradient * free).max()),
+            step=float(np.abs(x - before).max() / 2.0),
+            seconds=time.monotonic() - self.began,
+            post_processed=solid,
+            failure=failure,
+        )
+        run.history.append(iteration)
+        merit = (np.nan_to_num(solid, nan=-np.inf), value) if self.stage.solid else (value,)
+        if not failure and (self.best_merit is None or merit > self.best_merit):
+            run.best[self.index] = iteration
+            self.best_merit, self.best_gradient = merit, gradient
+        for callback in self.callbacks:
+            callback(run)
+        return None if failure else (value, gradient)
+
+    def _without_void(self, x: NDArray[np.float64]) -> float:
+        try:
+            return post_processed(self.problem, x)
+        except SimulationError as error:
+            logger.warning("the design fails without void: %s", error)
+            return np.nan
+
+    def _halve_time_step(self) -> None:
+        scene = self.problem.scene
+        logger.warning("no design of this stage ran yet: time step %g halved", scene.time_step)
+        self.problem = Problem(
+            scene.with_time_step(scene.time_step / 2.0), self.stage.beta, self.checkpointing
+        )
+
+    def _stop_reason(self, values: list[float]) -> str:
+        """Why the stage ends after these objective values, or nothing."""
+        settings = self.run.settings
+        count, window = len(values), settings.window
+        if count >= max(settings.least_iterations, window + 1):
+            change = abs(np.mean(values[-window:]) - np.mean(values[-window - 1 : -1]))
+            if change <= settings.tolerance:
+                last = self.run.history[-1]
+                return (
+                    f"the mean objective over {window} iterations changed by {change:.1e} <= "
+                    f"{settings.tolerance:.1e} after {count} of them (last step {last.step:.1e} of "
+                    f"the range, projected gradient {last.projected_gradient:.1e})."
+                )
+        if count >= settings.most_iterations:
+            return f"it reached its limit of {count} iterations."
+        return ""

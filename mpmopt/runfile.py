@@ -1,0 +1,181 @@
+"""The one file that a run leaves: scene, settings, versions, history and designs, in HDF5.
+
+Layout (version 1)::
+
+    attributes       format, version, scene and settings (JSON), versions (JSON), stop_reason
+    history/NAME     one entry per evaluation: objective, beta, greyness, step, ...
+    stages/K/        best design of stage K: x, gamma; attributes of its evaluation
+    best/            that of the last stage, with phi, a, theta, b spelled out
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import platform
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+import mpmopt
+from mpmopt.errors import MpmoptError, RunFileError, StorageError
+from mpmopt.optimize import Iteration, Optimisation, Settings, Stage
+from mpmopt.problem import Problem, Variables
+from mpmopt.scene import Scene
+
+FORMAT, VERSION = "mpmopt run", 1
+COLUMNS = tuple(f.name for f in dataclasses.fields(Iteration) if f.type == "float" or f.type == "int")
+
+
+@dataclass(frozen=True)
+class RunFile:
+    """What a run file holds.
+
+    Attributes
+    ----------
+    scene : Scene
+    settings : Settings
+    versions : dict of str to str
+        Of this package and of those it computes with.
+    history : dict of str to (n,) array
+        Columns named as the fields of `Iteration`.
+    designs : dict of int to (n,) array
+        The best design of each stage that had one.
+    stop_reason : str
+        Empty if the run was not finished.
+    """
+
+    scene: Scene
+    settings: Settings
+    versions: dict[str, str]
+    history: dict[str, NDArray]
+    designs: dict[int, NDArray[np.float64]]
+    stop_reason: str
+
+    def problem(self, stage: int | None = None) -> Problem:
+        """The problem that a stage solved, by default that of the best design."""
+        chosen = self.settings.stages[max(self.designs) if stage is None else stage]
+        return Problem(chosen.scene(self.scene), chosen.beta)
+
+    @property
+    def best(self) -> NDArray[np.float64]:
+        """The best design: that of the last stage that had one."""
+        return self.designs[max(self.designs)]
+
+
+def write(path: Path, run: Optimisation) -> None:
+    """Write a run as it stands; an older file of that name is replaced only by a complete one.
+
+    Raises
+    ------
+    StorageError
+        If the file cannot be written; an older one is still whole.
+    """
+    handle, name = -1, ""
+    try:
+        handle, name = tempfile.mkstemp(prefix=f".{path.name}-", dir=path.parent)
+        os.close(handle)
+        with h5py.File(name, "w") as file:
+            _fill(file, run)
+        with open(name, "rb") as written:
+            os.fsync(written.fileno())
+        os.chmod(name, 0o644)
+        os.replace(name, path)
+    except (OSError, RuntimeError) as error:
+        if name:
+            Path(name).unlink(missing_ok=True)
+        raise StorageError(f"cannot write {path}: {error}; make room or choose another folder") from error
+
+
+def _fill(file: h5py.File, run: Optimisation) -> None:
+    file.attrs["format"], file.attrs["version"] = FORMAT, VERSION
+    file.attrs["scene"] = run.scene.to_json()
+    file.attrs["settings"] = json.dumps(dataclasses.asdict(run.settings))
+    file.attrs["versions"] = json.dumps(_versions())
+    file.attrs["stop_reason"] = run.stop_reason
+    for name in COLUMNS:
+        column = np.array([getattr(item, name) for item in run.history], dtype=float)
+        file.create_dataset(f"history/{name}", data=column, dtype="f8")
+    file.create_dataset(
+        "history/failure", data=[i.failure for i in run.history], dtype=h5py.string_dtype()
+    )
+    for stage, item in run.best.items():
+        group = file.create_group(f"stages/{stage}")
+        group.create_dataset("x", data=item.x, dtype="f8")
+        group.create_dataset("gamma", data=item.gamma, dtype="f8")
+        for name in COLUMNS:
+            group.attrs[name] = getattr(item, name)
+    if run.best:
+        x, gamma = run.result.x, run.result.gamma
+        group = file.create_group("best")
+        for name, value in {"gamma": gamma, **Variables.of(x, gamma.size)._asdict()}.items():
+            group.create_dataset(name, data=value, dtype="f8")
+
+
+def _versions() -> dict[str, str]:
+    import numba
+    import scipy
+
+    return {
+        "mpmopt": mpmopt.__version__,
+        "python": platform.python_version(),
+        "numba": numba.__version__,
+        "numpy": np.__version__,
+        "scipy": scipy.__version__,
+        "h5py": h5py.__version__,
+    }
+
+
+def read(path: Path) -> RunFile:
+    """Read a run file.
+
+    Raises
+    ------
+    RunFileError
+        If it does not exist, is no run file, is damaged or of another version.
+    """
+    if not path.is_file():
+        raise RunFileError(f"{path} is not there; give the path of a run.h5")
+    try:
+        with h5py.File(path, "r") as file:
+            if file.attrs.get("format") != FORMAT:
+                raise RunFileError(f"{path} is HDF5 but no run file of mpmopt")
+            if file.attrs["version"] != VERSION:
+                raise RunFileError(
+                    f"{path} is a run file of version {file.attrs['version']}, this mpmopt reads "
+                    f"version {VERSION}; its versions: {file.attrs.get('versions')}"
+                )
+            settings = json.loads(file.attrs["settings"])
+            settings["stages"] = tuple(Stage(**stage) for stage in settings["stages"])
+            history: dict[str, Any] = {
+                name: _numbers(file, f"history/{name}") for name in COLUMNS
+            }
+            history["failure"] = file["history/failure"].asstr()[:]
+            stages = sorted(int(name) for name in file["stages"]) if "stages" in file else []
+            return RunFile(
+                scene=Scene.from_json(file.attrs["scene"]),
+                settings=Settings(**settings),
+                versions=json.loads(file.attrs["versions"]),
+                history=history,
+                designs={stage: _numbers(file, f"stages/{stage}/x") for stage in stages},
+                stop_reason=str(file.attrs["stop_reason"]),
+            )
+    except MpmoptError as error:
+        if isinstance(error, RunFileError):
+            raise
+        raise RunFileError(f"{path} is damaged: {error}") from error
+    except (OSError, KeyError, ValueError, TypeError, RuntimeError, AttributeError) as error:
+        raise RunFileError(f"{path} is no run file, or damaged: {error}") from error
+
+
+def _numbers(file: h5py.File, name: str) -> NDArray[np.float64]:
+    dataset = file[name]
+    if not isinstance(dataset, h5py.Dataset) or dataset.dtype != np.float64 or dataset.ndim != 1:
+        raise RunFileError(f"{name} is no column of 64-bit numbers")
+    return np.asarray(dataset[:], dtype=float)

@@ -1,0 +1,173 @@
+"""Which states are kept, what that costs, and that it changes no bit of the gradient."""
+
+import math
+import resource
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from walker import walker
+
+from mpmopt.checkpoints import MEGABYTE, Checkpointing, Checkpoints, Schedule
+from mpmopt.errors import DesignError, StorageError
+from mpmopt.problem import Problem
+
+SIZE = 1000  # bytes of a step
+
+
+@pytest.mark.parametrize("steps", [1, 2, 7, 100, 1250, 5000])
+@pytest.mark.parametrize("every", [1, 3, 71, 10**6, "all", None])
+@pytest.mark.parametrize("memory", [1, 200 * SIZE, 10**9])
+def test_segments_cover_every_step_once(steps, every, memory):
+    schedule = Schedule.choose(steps, SIZE, Checkpointing(every, memory))
+    covered = [n for first, last in schedule.segments for n in range(first, last)]
+    assert covered == list(range(steps))
+    assert all(last - first <= schedule.segment for first, last in schedule.segments)
+    assert 0 <= schedule.steps_recomputed < steps
+
+
+def test_all_states_stay_in_memory_if_they_fit():
+    schedule = Schedule.choose(1000, SIZE, Checkpointing(memory=1000 * SIZE))
+    assert schedule.segments == [(0, 1000)]
+    assert schedule.steps_recomputed == 0
+
+
+def test_else_memory_grows_as_the_root_of_the_steps_for_one_more_forward_run():
+    for steps in (1000, 5000, 20000):
+        schedule = Schedule.choose(steps, SIZE, Checkpointing(memory=700 * SIZE))
+        root = math.ceil(math.sqrt(steps))
+        assert schedule.segment == root
+        assert schedule.in_memory
+        assert schedule.stored_bytes + (root + 1) * SIZE <= (2 * root + 1) * SIZE
+        assert steps - root <= schedule.steps_recomputed < steps
+
+
+def test_a_store_over_the_budget_goes_to_disk():
+    schedule = Schedule.choose(5000, SIZE, Checkpointing(memory=100 * SIZE))
+    assert not schedule.in_memory
+    assert (schedule.segment + 1) * SIZE <= 100 * SIZE
+    assert not Schedule.choose(5000, SIZE, Checkpointing("all", 100 * SIZE)).in_memory
+    assert Schedule.choose(5000, SIZE, Checkpointing("all", 100 * SIZE)).steps_recomputed == 0
+    assert Schedule.choose(5000, SIZE, Checkpointing(3, 10 * SIZE, "memory")).in_memory
+
+
+def test_every_kth_state_recomputes_all_but_the_last_segment():
+    schedule = Schedule.choose(100, SIZE, Checkpointing(every=30))
+    assert schedule.segments == [(0, 30), (30, 60), (60, 90), (90, 100)]
+    assert schedule.steps_recomputed == 90
+
+
+@pytest.mark.parametrize("wrong", [{"every": 0}, {"every": "some"}, {"memory": 0}, {"store": 3}])
+def test_senseless_wishes_are_refused(wrong):
+    with pytest.raises(DesignError, match=next(iter(wrong))):
+        Checkpointing(**wrong)
+
+
+@pytest.fixture(scope="module")
+def rough_walker():
+    """The preview's walker with a random design, 250 steps of it, and its gradient."""
+    scene = walker(64, 8e-4).with_floors(1e-2, 1e-3)
+    scene = type(scene)(**{**vars(scene), "steps": 250})
+    problem = Problem(scene, beta=2.0)
+    design = np.random.default_rng(3).uniform(-1.0, 1.0, problem.size - 3)
+    x = problem.join(design, 0.9, -0.3, -0.5)
+    return scene, x, problem.value_and_gradient(x)
+
+
+@pytest.mark.parametrize("store", ["memory", "disk", None])
+@pytest.mark.parametrize("every", [1, 7, 16, 250, "all"])
+def test_no_schedule_changes_a_bit_of_the_gradient(rough_walker, every, store):
+    scene, x, (value, gradient) = rough_walker
+    problem = Problem(scene, 2.0, Checkpointing(every=every, store=store))
+    other_value, other_gradient = problem.value_and_gradient(x)
+    assert other_value == value
+    assert np.array_equal(other_gradient, gradient)
+
+
+def test_a_tiny_budget_changes_no_bit_either(rough_walker):
+    scene, x, (value, gradient) = rough_walker
+    problem = Problem(scene, 2.0, Checkpointing(memory=MEGABYTE // 2))
+    schedule = problem.simulation(x).schedule(problem.checkpointing)
+    assert not schedule.in_memory
+    assert (schedule.segment + 1) * schedule.step_bytes <= MEGABYTE // 2
+    other_value, other_gradient = problem.value_and_gradient(x)
+    assert other_value == value
+    assert np.array_equal(other_gradient, gradient)
+
+
+def test_the_scratch_file_is_removed_and_one_that_was_asked_for_is_kept(
+    rough_walker, tmp_path, monkeypatch
+):
+    scene, x, _ = rough_walker
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    Problem(scene, 2.0, Checkpointing(every=50, store="disk")).value_and_gradient(x)
+    assert list(tmp_path.iterdir()) == []
+
+    kept = tmp_path / "states.h5"
+    problem = Problem(scene, 2.0, Checkpointing(every=50, store=kept))
+    problem.value_and_gradient(x)
+    states = problem.simulation(x).run([0, 50, 100, 150, 200])
+    with h5py.File(kept) as file:
+        for index, state in enumerate(states):
+            assert np.array_equal(file[f"{index}/state"][()], state)
+            assert file[f"{index}/state"].dtype == np.float64
+
+
+def test_the_scratch_file_is_removed_when_the_simulation_fails(
+    rough_walker, tmp_path, monkeypatch
+):
+    scene, x, _ = rough_walker
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+
+    def fail(*_):
+        raise RuntimeError("stop")
+
+    monkeypatch.setattr("mpmopt.simulate.Forward.reverse", fail)
+    with pytest.raises(RuntimeError, match="stop"):
+        Problem(scene, 2.0, Checkpointing(every=50, store="disk")).value_and_gradient(x)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_too_little_room_on_the_disk_is_said_before_any_step(tmp_path):
+    free = shutil.disk_usage(tmp_path).free
+    schedule = Schedule(10**6, 1000, True, False, 10 * free // 10**6)
+    with pytest.raises(StorageError, match=r"checkpoints need \d+ MB but .* has \d+ MB free"):
+        Checkpoints(schedule, tmp_path / "states.h5")
+
+
+def test_a_folder_that_is_not_there_is_a_storage_error(tmp_path):
+    schedule = Schedule(10, 1, False, False, 100)
+    with pytest.raises(StorageError, match="checkpoint file"):
+        Checkpoints(schedule, tmp_path / "nowhere" / "states.h5")
+
+
+FILL = """
+import resource, sys
+from pathlib import Path
+import numpy as np
+from mpmopt.checkpoints import Checkpoints, Schedule
+from mpmopt.errors import StorageError
+resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
+store = Path(sys.argv[1])
+try:
+    with Checkpoints(Schedule(10, 1, False, False, 30_000), store) as checkpoints:
+        for index in range(10):
+            checkpoints.write(index, state=np.full(3_750, float(index)))
+            assert np.all(checkpoints.read(index, "state") == index)
+except StorageError as error:
+    print(f"segment {index}: {error}")
+"""
+
+
+@pytest.mark.skipif(not hasattr(resource, "RLIMIT_FSIZE"), reason="needs a file-size limit")
+def test_a_file_that_can_grow_no_more_is_a_storage_error(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-c", FILL, tmp_path / "states.h5"],
+        capture_output=True, text=True, timeout=60, cwd=Path(__file__).parent.parent,
+    )  # fmt: skip
+    assert "cannot store 30000 bytes of segment" in done.stdout, done.stderr
+    assert "make room" in done.stdout

@@ -1,0 +1,127 @@
+"""Filter, projection, interpolation."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from conftest import small_scene
+from walker import walker
+
+from mpmopt.design import DesignChain, filter_matrix, greyness, interpolate, project
+from mpmopt.errors import DesignError
+from mpmopt.particles import lay_out
+from mpmopt.scene import Design, Grid, Material, Scene, Solid
+
+
+def test_filter_keeps_constants_and_never_amplifies():
+    scene = walker(64, 8e-4)
+    matrix = filter_matrix(scene, lay_out(scene))
+    assert matrix.sum(axis=1) == pytest.approx(1.0, abs=1e-14)
+    assert matrix.data.min() >= 0.0
+
+
+def literal_filter(scene, phi):
+    """The paper's three steps, loop by loop, on grid nodes that carry design particles."""
+    particles = lay_out(scene)
+    position = particles.position[particles.designed]
+    dx = scene.grid.dx
+    weight, value = {}, {}
+
+    def near(x):
+        i, j = (int(c / dx - 0.5) for c in x)
+        for a in range(3):
+            for b in range(3):
+                w = 1.0
+                for k, c in ((i + a, x[0]), (j + b, x[1])):
+                    r = abs(c / dx - k)
+                    w *= 0.75 - r**2 if r < 0.5 else 0.5 * (1.5 - r) ** 2
+                if w > 0.0:
+                    yield (i + a, j + b), w
+
+    for x, v in zip(position, phi, strict=True):
+        for node, w in near(x):
+            weight[node] = weight.get(node, 0.0) + w
+            value[node] = value.get(node, 0.0) + w * v
+    value = {node: value[node] / weight[node] for node in value}
+    w0, w1, w2 = scene.filter_weights
+    smooth = {}
+    for i, j in value:
+        total = share = 0.0
+        for a in (-1, 0, 1):
+            for b in (-1, 0, 1):
+                if (i + a, j + b) in value:
+                    w = (w0, w1, w2)[abs(a) + abs(b)]
+                    total += w * value[i + a, j + b]
+                    share += w
+        smooth[i, j] = total / share
+    return [sum(w * smooth[node] for node, w in near(x)) for x in position]
+
+
+@pytest.mark.parametrize("per_cell", [1, 2])
+def test_filter_is_the_papers_three_steps(rng, per_cell):
+    c = 1 / 16
+    # An L-shaped design domain around a solid corner.
+    body = (
+        Design((3 * c, 4 * c), (7 * c, 6 * c)),
+        Design((3 * c, 6 * c), (5 * c, 8 * c)),
+        Solid((5 * c, 6 * c), (7 * c, 8 * c)),
+    )
+    scene = small_scene(body=body, walls=(), particles_per_cell=per_cell)
+    matrix = filter_matrix(scene, lay_out(scene))
+    phi = rng.uniform(-1.0, 1.0, matrix.shape[1])
+    assert matrix @ phi == pytest.approx(literal_filter(scene, phi), abs=1e-14)
+
+
+def test_filter_does_not_wrap_round_the_edge_of_the_grid(rng):
+    dx = 1 / 8
+    scene = Scene(
+        Grid((8, 8), dx), 1e-3, 1,
+        body=(Design((dx, dx), (7 * dx, 6 * dx)), Solid((dx, 6 * dx), (7 * dx, 7 * dx))),
+    )  # fmt: skip
+    matrix = filter_matrix(scene, lay_out(scene))
+    phi = rng.uniform(-1.0, 1.0, matrix.shape[1])
+    assert matrix @ phi == pytest.approx(literal_filter(scene, phi), abs=1e-14)
+
+
+@pytest.mark.parametrize("beta", [0.5, 1.0, 16.0])
+def test_projection_hits_its_ends_and_is_odd_about_a_half(beta):
+    assert project(np.array([-1.0, 0.0, 1.0]), beta) == pytest.approx([0.0, 0.5, 1.0], abs=1e-15)
+    phi = np.linspace(-1.0, 1.0, 21)
+    gamma = project(phi, beta)
+    assert np.all(np.diff(gamma) >= 0.0)
+    assert gamma + gamma[::-1] == pytest.approx(1.0, abs=1e-15)
+
+
+def test_interpolation_reaches_solid_and_both_floors():
+    material = Material(2.0, 3.0, density=5.0, stiffness_floor=1e-3, mass_floor=1e-2)
+    density, la, mu = interpolate(material, np.array([0.0, 0.5, 1.0]))
+    assert density == pytest.approx([0.05, 2.525, 5.0], rel=1e-14)
+    assert la == pytest.approx([2e-3, 1.001, 2.0], rel=1e-14)
+    assert mu == pytest.approx([3e-3, 1.5015, 3.0], rel=1e-14)
+
+
+def test_undesigned_particles_are_solid_whatever_the_design(scene):
+    particles = lay_out(scene)
+    chain = DesignChain(scene, particles, 1.0)
+    for density in (chain.material(np.full(particles.designed.sum(), v))[0] for v in (-1.0, 1.0)):
+        assert np.all(density[~particles.designed] == scene.material.density)
+
+
+def test_greyness():
+    assert greyness(np.array([0.0, 1.0])) == 0.0
+    assert greyness(np.full(3, 0.5)) == 1.0
+    assert greyness(np.zeros(0)) == 0.0
+
+
+@pytest.mark.parametrize("beta", [0.0, -1.0, np.nan, np.inf])
+def test_senseless_beta_is_refused(scene, beta):
+    with pytest.raises(DesignError, match="beta"):
+        DesignChain(scene, lay_out(scene), beta)
+
+
+def test_a_body_without_design_domain_has_no_variables_to_filter():
+    scene = small_scene()
+    scene = dataclasses.replace(scene, body=scene.body[1:])
+    chain = DesignChain(scene, lay_out(scene), 1.0)
+    assert chain.gamma(np.zeros(0)).shape == (0,)
+    assert np.all(chain.material(np.zeros(0))[0] == 1.0)

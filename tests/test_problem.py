@@ -1,0 +1,125 @@
+"""Objective and gradient of the whole chain."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from conftest import small_scene
+from walker import walker
+
+from mpmopt.binary import distance, full_block, post_processed
+from mpmopt.errors import DesignError, SimulationError
+from mpmopt.problem import Problem
+from mpmopt.verify import COMPLEX_STEP, COMPLEX_TOLERANCE, complex_step_errors
+
+
+@pytest.fixture
+def problem(scene):
+    return Problem(scene, beta=2.0)
+
+
+@pytest.fixture
+def x(problem, rng):
+    return problem.join(rng.uniform(-0.8, 0.8, 32), [0.9, 0.5], [-0.3, 0.2], [-0.5, 0.1])
+
+
+def test_gradient_of_the_preview_walker_over_all_its_steps(rng):
+    problem = Problem(walker(64, 8e-4).with_floors(1e-2, 1e-3), beta=2.0)
+    x = problem.join(rng.uniform(-1.0, 1.0, problem.size - 3), 0.9, -0.3, -0.5)
+    errors = complex_step_errors(problem, x)
+    assert set(errors) == {
+        "phi along direction 0", "phi along direction 1",
+        "a of actuator 0", "theta of actuator 0", "b of actuator 0",
+    }  # fmt: skip
+    assert max(errors.values()) <= COMPLEX_TOLERANCE
+    # The complex run's real part is the run itself.
+    value, _ = problem.value_and_gradient(x)
+    assert problem.value(x + 1j * COMPLEX_STEP).real == pytest.approx(value, rel=1e-14)
+
+
+@pytest.mark.parametrize("beta", [0.5, 8.0])
+def test_gradient_with_friction_two_walls_and_two_actuators(problem, x, beta):
+    problem = Problem(problem.scene, beta)
+    assert max(complex_step_errors(problem, x, directions=3).values()) <= COMPLEX_TOLERANCE
+
+
+def test_gradient_in_a_slanted_direction_and_three_particles_a_cell():
+    scene = small_scene(direction=(0.6, -0.8), particles_per_cell=3)
+    problem = Problem(scene)
+    x = problem.join(0.1, [0.9, 0.5], [-0.3, 0.2], [-0.5, 0.1])
+    assert max(complex_step_errors(problem, x).values()) <= COMPLEX_TOLERANCE
+
+
+def test_value_is_that_of_value_and_gradient(problem, x):
+    value, gradient = problem.value_and_gradient(x)
+    assert problem.value(x) == value
+    assert gradient.shape == x.shape
+    assert problem.value_and_gradient(x)[0] == value
+
+
+def test_the_gradient_points_uphill(problem, x):
+    value, gradient = problem.value_and_gradient(x)
+    step = 1e-4 * gradient / np.abs(gradient).max()
+    assert problem.value(np.clip(x + step, -1, 1)) > value > problem.value(np.clip(x - step, -1, 1))
+
+
+def test_a_body_at_rest_stays_where_it_is():
+    scene = small_scene(gravity=(0.0, 0.0), walls=())
+    problem = Problem(scene)
+    x = problem.join(0.3, 0.0, 0.2, 0.0)
+    value, gradient = problem.value_and_gradient(x)
+    c = 1 / 16
+    assert value == pytest.approx(5 * c, rel=1e-14)  # centre of the row above the design domain
+    theta = problem.split(gradient).theta
+    assert np.all(theta == 0.0)  # with a = 0 the phase does not matter
+
+
+def test_a_scene_without_actuators_still_has_a_gradient():
+    scene = small_scene()
+    scene = dataclasses.replace(scene, body=(scene.body[0], scene.body[2]))
+    problem = Problem(scene, beta=1.0)
+    x = problem.join(np.linspace(-0.5, 0.5, 32), 0.0, 0.0, 0.0)
+    assert problem.size == 32
+    assert max(complex_step_errors(problem, x).values()) <= COMPLEX_TOLERANCE
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda x: x[:-1], r"\(37,\).*\(38,\)"),
+        (lambda x: np.where(np.arange(x.size) == 4, np.nan, x), r"1 of 38 .* x\[4\] = nan"),
+        (lambda x: np.where(np.arange(x.size) == 5, 1.1, x), r"1 of 38 .* x\[5\] = 1.1"),
+        (lambda x: x[:, None], r"\(38, 1\)"),
+    ],
+)
+def test_designs_that_do_not_fit_are_refused(problem, x, change, says):
+    for function in (problem.value, problem.value_and_gradient, problem.gamma):
+        with pytest.raises(DesignError, match=says):
+            function(change(x))
+
+
+def test_a_result_that_is_not_finite_never_leaves(problem, x, monkeypatch):
+    monkeypatch.setattr("mpmopt.objective.Objective.value", lambda *_: np.nan)
+    with pytest.raises(SimulationError, match="1 of 1 results are not finite"):
+        problem.value_and_gradient(x)
+
+
+def test_a_black_design_without_its_void_is_the_solid_body(problem):
+    black = problem.join(1.0, [0.9, 0.5], [-0.3, 0.2], [-0.5, 0.1])
+    everything = np.ones(32, dtype=bool)
+    value = distance(problem.scene, everything, problem.split(black))
+    assert problem.value(black) == pytest.approx(value, rel=1e-13)
+    assert post_processed(problem, black) == pytest.approx(value, rel=1e-13)
+    still = problem.join(0.0, 0.0, 0.0, 0.0)
+    assert full_block(problem, still, black) >= value
+
+
+def test_removing_void_keeps_what_is_above_the_threshold(problem):
+    half = np.where(np.arange(32) < 16, 1.0, -1.0)
+    x = problem.join(half, [0.9, 0.5], [-0.3, 0.2], [-0.5, 0.1])
+    gamma = problem.gamma(x)
+    expected = distance(problem.scene, gamma >= 0.3, problem.split(x))
+    assert post_processed(problem, x) == expected
+    assert post_processed(problem, x, threshold=gamma.min()) != expected
+    with pytest.raises(DesignError, match=r"\(31,\)"):
+        distance(problem.scene, np.ones(31, dtype=bool), problem.split(x))

@@ -1,0 +1,106 @@
+"""Running bodies: what is returned, and what happens where the method fails."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from conftest import small_scene
+
+from mpmopt.errors import DesignError, SimulationError
+from mpmopt.particles import lay_out
+from mpmopt.simulate import Simulation
+
+
+def simulation(scene, state=None, **material):
+    particles = lay_out(scene)
+    ones = np.ones(len(particles.position))
+    material = {"density": ones, "lame_lambda": 10 * ones, "lame_mu": 10 * ones, **material}
+    signal = np.zeros((scene.steps, len(scene.actuators)))
+    return Simulation(scene, particles, **{"signal": signal, **material}, state=state)
+
+
+def test_frames_are_the_states_on_the_way(scene):
+    run = simulation(scene)
+    frames = run.run([0, 3, 3, 40])
+    assert np.array_equal(frames[0], run.initial)
+    assert np.array_equal(frames[1], frames[2])
+    assert np.array_equal(frames[3], run.run())
+    shorter = simulation(dataclasses.replace(scene, steps=3))
+    assert np.array_equal(shorter.run(), frames[1])
+
+
+@pytest.mark.parametrize("frames", [[-1], [41], [3, 2]])
+def test_frames_outside_the_run_are_refused(scene, frames):
+    with pytest.raises(DesignError, match="from 0 to 40"):
+        simulation(scene).run(frames)
+
+
+def test_a_run_leaves_its_simulation_as_it_was(scene):
+    run = simulation(scene)
+    assert np.array_equal(run.run(), run.run())
+
+
+def test_a_body_that_spreads_finds_room(scene):
+    # The window outgrows its first size while the body flies apart.
+    free = dataclasses.replace(scene, walls=(), gravity=(0.0, 0.0))
+    run = simulation(free)
+    state = run.initial.copy()
+    centre = state[0:2].mean(axis=1, keepdims=True)
+    state[2:4] = 8.0 * (state[0:2] - centre)
+    weak = np.full(state.shape[1], 1e-9)
+    frames = simulation(free, state, lame_lambda=weak, lame_mu=weak).run([0, 40])
+    spread = [np.ptp(frame[0]) for frame in frames]
+    assert spread[1] >= 2.0 * spread[0]
+
+
+def test_a_particle_that_leaves_the_grid_ends_the_run_by_name(scene):
+    state = simulation(scene).initial.copy()
+    state[2] = 5.0
+    with pytest.raises(SimulationError, match="left the grid") as error:
+        simulation(dataclasses.replace(scene, walls=()), state).run()
+    assert 0 < error.value.step < 40
+    assert error.value.particle >= 0
+    assert error.value.position[0] >= 1.0 - scene.grid.dx
+    assert f"step {error.value.step}, particle {error.value.particle} at" in str(error.value)
+    assert "larger grid" in str(error.value)
+
+
+def test_an_inverted_particle_ends_the_run_by_name(scene):
+    state = simulation(scene).initial.copy()
+    state[8, 7] = -0.5
+    with pytest.raises(SimulationError, match="inverted") as error:
+        simulation(scene, state).run()
+    assert (error.value.step, error.value.particle) == (0, 7)
+
+
+def test_what_becomes_infinite_ends_the_run_by_name(scene):
+    state = simulation(scene).initial.copy()
+    state[2, 3] = 1e308
+    state[3, 3] = -1e308
+    with pytest.raises(SimulationError, match=r"left the grid|not a number"):
+        simulation(scene, state).run()
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"density": np.ones(3)}, r"\(3,\), must have \(48,\)"),
+        ({"density": np.zeros(48)}, "must be above 0"),
+        ({"lame_mu": np.full(48, np.nan)}, "lame_mu holds 48 values not finite"),
+        ({"signal": np.zeros((40, 1))}, r"\(40, 1\), must have \(40, 2\)"),
+        ({"state": np.zeros((12, 47))}, r"\(12, 47\), must have \(12, 48\)"),
+    ],
+)
+def test_arrays_that_do_not_fit_are_refused(scene, change, says):
+    with pytest.raises(DesignError, match=says):
+        simulation(scene, **change)
+
+
+def test_a_body_without_particles_is_refused(scene):
+    nothing = lay_out(scene).subset(np.zeros(48, dtype=bool))
+    with pytest.raises(DesignError, match="no particles"):
+        Simulation(
+            scene, nothing, np.zeros(0), np.zeros(0), np.zeros(0), np.zeros((scene.steps, 2))
+        )
+
+
