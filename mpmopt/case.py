@@ -103,7 +103,7 @@ def summarise(result: Optimisation, start: np.ndarray) -> dict[str, Any]:
     """Objective values (L, larger is farther), actuation and counts of a finished optimisation."""
     best = result.result
     stage = result.settings.stages[best.stage]
-    problem = Problem(stage.scene(result.scene).with_time_step(best.time_step), stage.beta)
+    problem = Problem(stage.scene(result.scene).vary(time_step=best.time_step), stage.beta)
     actuation = problem.split(best.x)
 
     def numbers(values: np.ndarray) -> float | list[float]:
@@ -138,7 +138,7 @@ def _draw(out: Path, result: Optimisation, summary: Mapping[str, Any]) -> None:
 
     best = result.result
     stage = result.settings.stages[best.stage]
-    problem = Problem(stage.scene(result.scene).with_time_step(best.time_step), stage.beta)
+    problem = Problem(stage.scene(result.scene).vary(time_step=best.time_step), stage.beta)
     plot.plot_design(
         out / "design.png", problem, best.x, f"Optimised design, L = {summary['optimised']:.3f}"
     )

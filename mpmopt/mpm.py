@@ -21,7 +21,7 @@ The kernels also compile for complex128, which makes the complex step an oracle 
 cells, walls and comparisons look at real parts only. They know arrays and numbers, no user objects,
 and they live in one file because Numba's disk cache does not see changes in another one.
 
-Sources: Hu et al. 2018 (MLS-MPM), Jiang et al. 2015 (APIC), Sato et al. 2023 (actuation, objective).
+Sources: Hu et al. 2018 (MLS-MPM), Jiang et al. 2015 (APIC), Sato et al. 2023 (actuation).
 """
 
 from typing import NamedTuple
@@ -88,7 +88,7 @@ class Scratch(NamedTuple):
 
 @jit
 def weights(x, dx):
-    """Base node, and quadratic B-spline weights of nodes base, base + 1, base + 2 with distances."""
+    """Base node, quadratic B-spline weights of it and the next two nodes, and their distances."""
     base = int(x.real / dx - 0.5)
     f = x / dx - base
     w = (0.5 * (1.5 - f) ** 2, 0.75 - (f - 1.0) ** 2, 0.5 * (f - 0.5) ** 2)
@@ -273,8 +273,8 @@ def p2g(state, body, world, scratch, window, grid):
 
 @jit
 def p2g_adjoint(state, body, world, scratch, window, bar, body_bar):
-    """From momentum_bar and mass_bar of the nodes to v_bar, A_bar, x_bar and the particles' mass."""
-    i0, j0, ni, nj = window
+    """From momentum_bar and mass_bar of nodes to v_bar, A_bar, x_bar and mass_bar of particles."""
+    i0, j0, _, nj = window
     x, v, A = state[0:2], state[2:4], scratch.affine
     x_bar, v_bar, A_bar = bar[0:2], bar[2:4], scratch.affine_bar
     grid_bar = scratch.node_bar
@@ -296,9 +296,7 @@ def p2g_adjoint(state, body, world, scratch, window, bar, body_bar):
             for b in range(3):
                 qx_bar, qy_bar = grid_bar[node + b, 0], grid_bar[node + b, 1]
                 m_bar = grid_bar[node + b, 2]
-                w_bar = (
-                    qx_bar * (row_x + a01 * ry[b]) + qy_bar * (row_y + a11 * ry[b]) + m_bar * m
-                )
+                w_bar = qx_bar * (row_x + a01 * ry[b]) + qy_bar * (row_y + a11 * ry[b]) + m_bar * m
                 across += wy[b] * w_bar
                 along += slope_y[b] * w_bar
                 row_qx += wy[b] * qx_bar
@@ -374,7 +372,7 @@ def wall_adjoint(i, j, u, v, world, u_bar, v_bar):
 
 @jit
 def grid_update(grid, window, world, scratch):
-    """Velocity of the window's nodes from momentum, gravity and walls; zero where there is no mass."""
+    """Velocity of the nodes from momentum, gravity and walls; zero where there is no mass."""
     i0, j0, ni, nj = window
     for a in range(ni):
         for b in range(nj):
@@ -420,7 +418,7 @@ def grid_update_adjoint(grid, window, world, scratch):
 @jit
 def g2p(old, new, world, scratch, window):
     """Grid to particle: the new velocity, affine velocity and position."""
-    i0, j0, ni, nj = window
+    i0, j0, _, nj = window
     c = 4.0 / world.dx**2
     velocity = scratch.velocity
     for p in range(old.shape[1]):
@@ -532,6 +530,4 @@ def advance_adjoint(states, grids, windows, first, last, body, world, signal, sc
         g2p_adjoint(old, new, world, scratch, window, bar)
         grid_update_adjoint(grid, window, world, scratch)
         p2g_adjoint(old, body, world, scratch, window, bar, body_bar)
-        stress_adjoint(
-            old, new, body, world, signal[n], scratch, bar, body_bar, signal_bar[n]
-        )
+        stress_adjoint(old, new, body, world, signal[n], scratch, bar, body_bar, signal_bar[n])

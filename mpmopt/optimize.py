@@ -48,8 +48,10 @@ class Stage:
 
     def scene(self, scene: Scene) -> Scene:
         """The scene as this stage simulates it."""
-        return scene.with_floors(self.mass_floor, self.stiffness_floor).with_time_step(
-            self.time_step
+        return scene.vary(
+            time_step=self.time_step,
+            mass_floor=self.mass_floor,
+            stiffness_floor=self.stiffness_floor,
         )
 
 
@@ -291,9 +293,9 @@ class _StageRun:
             evaluated = self._evaluate(x, mma.move_limit)
             if evaluated is None:
                 failures += 1
-                last = self.run.history[-1].failure
                 if failures >= settings.most_failures:
-                    return x, f"it gave up after {failures} failed evaluations in a row, {last}", True
+                    why = f"it gave up after {failures} failed evaluations in a row."
+                    return x, why, True
                 best = self.run.best.get(self.index)
                 if best is None or self.best_gradient is None:
                     self._halve_time_step()
@@ -363,7 +365,7 @@ class _StageRun:
         scene = self.problem.scene
         logger.warning("no design of this stage ran yet: time step %g halved", scene.time_step)
         self.problem = Problem(
-            scene.with_time_step(scene.time_step / 2.0), self.stage.beta, self.checkpointing
+            scene.vary(time_step=scene.time_step / 2.0), self.stage.beta, self.checkpointing
         )
 
     def _stop_reason(self, values: list[float]) -> str:

@@ -141,9 +141,7 @@ class Problem:
             value = float(_finite(self.objective.value(forward.state), simulation))
             bars = forward.reverse(self.objective.seed(forward.state))
         phi_bar = self.chain.pullback(phi, bars.density, bars.lame_lambda, bars.lame_mu)
-        gradient = np.concatenate(
-            [phi_bar, *signal_adjoint(self.scene, a, theta, bars.signal)]
-        )
+        gradient = np.concatenate([phi_bar, *signal_adjoint(self.scene, a, theta, bars.signal)])
         return value, _finite(gradient, simulation)
 
 

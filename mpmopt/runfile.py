@@ -30,7 +30,7 @@ from mpmopt.problem import Problem, Variables
 from mpmopt.scene import Scene
 
 FORMAT, VERSION = "mpmopt run", 1
-COLUMNS = tuple(f.name for f in dataclasses.fields(Iteration) if f.type == "float" or f.type == "int")
+COLUMNS = tuple(f.name for f in dataclasses.fields(Iteration) if f.type in ("int", "float"))
 
 
 @dataclass(frozen=True)
@@ -83,14 +83,16 @@ def write(path: Path, run: Optimisation) -> None:
         os.close(handle)
         with h5py.File(name, "w") as file:
             _fill(file, run)
-        with open(name, "rb") as written:
+        with Path(name).open("rb") as written:
             os.fsync(written.fileno())
-        os.chmod(name, 0o644)
+        Path(name).chmod(0o644)
         os.replace(name, path)
     except (OSError, RuntimeError) as error:
         if name:
             Path(name).unlink(missing_ok=True)
-        raise StorageError(f"cannot write {path}: {error}; make room or choose another folder") from error
+        raise StorageError(
+            f"cannot write {path}: {error}; make room or choose another folder"
+        ) from error
 
 
 def _fill(file: h5py.File, run: Optimisation) -> None:
@@ -153,9 +155,7 @@ def read(path: Path) -> RunFile:
                 )
             settings = json.loads(file.attrs["settings"])
             settings["stages"] = tuple(Stage(**stage) for stage in settings["stages"])
-            history: dict[str, Any] = {
-                name: _numbers(file, f"history/{name}") for name in COLUMNS
-            }
+            history: dict[str, Any] = {name: _numbers(file, f"history/{name}") for name in COLUMNS}
             history["failure"] = file["history/failure"].asstr()[:]
             stages = sorted(int(name) for name in file["stages"]) if "stages" in file else []
             return RunFile(

@@ -412,27 +412,34 @@ class Scene(_Checked):
         """Simulated time."""
         return self.steps * self.time_step
 
-    def with_floors(self, mass: float, stiffness: float) -> Scene:
-        """The same scene with other floors of the void's mass and stiffness."""
-        material = dataclasses.replace(self.material, mass_floor=mass, stiffness_floor=stiffness)
-        return dataclasses.replace(self, material=material)
-
-    def with_time_step(self, time_step: float) -> Scene:
-        """The same scene and duration in steps of another length.
+    def vary(
+        self,
+        *,
+        time_step: float | None = None,
+        mass_floor: float | None = None,
+        stiffness_floor: float | None = None,
+    ) -> Scene:
+        """The same scene and duration with another time step or other floors of the void.
 
         Raises
         ------
         SceneError
-            If the duration is no multiple of the new step.
+            If the duration is no multiple of the new step, or the result cannot be simulated.
         """
-        time_step = _number("Scene", "time_step", time_step, above=0.0)
-        steps = round(self.duration / time_step)
-        if steps < 1 or abs(steps * time_step - self.duration) > 1e-9 * self.duration:
-            raise SceneError(
-                f"Scene: duration {self.duration:g} is no multiple of time_step = {time_step:g}; "
-                f"the nearest that divides it is {self.duration / max(steps, 1):.10g}"
-            )
-        return dataclasses.replace(self, time_step=time_step, steps=steps)
+        floors = {"mass_floor": mass_floor, "stiffness_floor": stiffness_floor}
+        given = {name: value for name, value in floors.items() if value is not None}
+        steps, material = self.steps, dataclasses.replace(self.material, **given)
+        if time_step is None:
+            time_step = self.time_step
+        else:
+            time_step = _number("Scene", "time_step", time_step, above=0.0)
+            steps = max(1, round(self.duration / time_step))
+            if abs(steps * time_step - self.duration) > 1e-9 * self.duration:
+                raise SceneError(
+                    f"Scene: duration {self.duration:g} is no multiple of time_step = "
+                    f"{time_step:g}; the nearest that divides it is {self.duration / steps:.10g}"
+                )
+        return dataclasses.replace(self, time_step=time_step, steps=steps, material=material)
 
     def to_json(self) -> str:
         """The scene as JSON text, from which `from_json` makes exactly the same scene."""

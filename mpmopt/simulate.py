@@ -267,9 +267,7 @@ class Forward:
         The final state.
     """
 
-    def __init__(
-        self, simulation: Simulation, checkpoints: Checkpoints, memory: _Segment
-    ) -> None:
+    def __init__(self, simulation: Simulation, checkpoints: Checkpoints, memory: _Segment) -> None:
         self._simulation, self._checkpoints, self._memory = simulation, checkpoints, memory
         first, last = checkpoints.schedule.segments[-1]
         self.state = memory.states[last - first].copy()

@@ -28,6 +28,7 @@ from mpmopt.scene import Scene, Wall
 from mpmopt.simulate import Simulation, world_of
 
 COMPLEX_STEP = 1e-30
+DEFAULT_TAYLOR_STEPS = 0.5 ** np.arange(7.0, 12.0)
 
 DOT_TOLERANCE = 1e-13
 COMPLEX_TOLERANCE = 1e-10
@@ -71,7 +72,7 @@ def dot_product_mismatch(
 
 
 def kernel_mismatches(scene: Scene, seed: int = 0) -> dict[str, float]:
-    """Dot-product test of every kernel and link of the chain, on a body of the scene in rough motion.
+    """Dot-product test of every kernel and link of the chain, on the body in rough motion.
 
     Parameters
     ----------
@@ -100,7 +101,7 @@ def kernel_mismatches(scene: Scene, seed: int = 0) -> dict[str, float]:
     }
     chain, objective = DesignChain(scene, bench.particles, 2.0), bench.objective
     result["design"] = dot_product_mismatch(
-        lambda v: dict(zip(("rho", "la", "mu"), chain.material(v["phi"]), strict=True)),
+        lambda v: dict(zip(("rho", "la", "mu"), chain.material(v["phi"]))),
         lambda v, w: {"phi": chain.pullback(v["phi"], w["rho"], w["la"], w["mu"])},
         {"phi": rng.uniform(-0.5, 0.5, int(bench.particles.designed.sum()))},
         rng,
@@ -109,10 +110,7 @@ def kernel_mismatches(scene: Scene, seed: int = 0) -> dict[str, float]:
     if count:
         result["signal"] = dot_product_mismatch(
             lambda v: {"s": signal(scene, v["a"], v["theta"], v["b"])},
-            lambda v, w: dict(
-                zip(("a", "theta", "b"), signal_adjoint(scene, v["a"], v["theta"], w["s"]),
-                    strict=True)
-            ),  # fmt: skip
+            lambda v, w: dict(zip(v, signal_adjoint(scene, v["a"], v["theta"], w["s"]))),
             {name: rng.uniform(-1.0, 1.0, count) for name in ("a", "theta", "b")},
             rng,
         )
@@ -135,7 +133,7 @@ class _Bench:
         dx = scene.grid.dx
         # Fast enough to hit walls and to slide on them, and well deformed, but not inverted.
         speed = dx / scene.time_step
-        self.state = np.zeros((mpm.STATE_SIZE, count))
+        self.state: NDArray = np.zeros((mpm.STATE_SIZE, count))
         self.state[0:2] = self.particles.position.T
         self.state[2:4] = 0.1 * speed * rng.standard_normal((2, count))
         self.state[4:8] = 0.1 / scene.time_step * rng.uniform(-1.0, 1.0, (4, count))
@@ -191,7 +189,7 @@ class _Bench:
         )
 
     def _state(self, v: Arrays, dtype: type) -> NDArray:
-        state = self.state.astype(dtype)
+        state: NDArray = self.state.astype(dtype)
         for name, rows in (
             ("position", slice(0, 2)),
             ("velocity", slice(2, 4)),
@@ -331,9 +329,7 @@ def complex_step_errors(
     errors = {}
     for name, d in vectors.items():
         exact = problem.value(x + 1j * COMPLEX_STEP * d).imag / COMPLEX_STEP
-        errors[name] = float(abs(exact - gradient @ d) / abs(exact)) if exact else float(
-            abs(gradient @ d)
-        )
+        errors[name] = float(abs(exact - gradient @ d) / (abs(exact) or 1.0))
     return errors
 
 
@@ -359,7 +355,7 @@ def taylor_test(
     problem: Problem,
     x: NDArray[np.float64],
     direction: NDArray[np.float64],
-    steps: NDArray[np.float64] | None = None,
+    steps: NDArray[np.float64] = DEFAULT_TAYLOR_STEPS,
 ) -> Taylor:
     """Remainders of the objective's first-order expansion at x.
 
@@ -374,8 +370,6 @@ def taylor_test(
     steps : (k,) array, optional
         Default: 1/128 to 1/2048, for a direction whose entries are about one.
     """
-    if steps is None:
-        steps = 0.5 ** np.arange(7, 12)
     value, gradient = problem.value_and_gradient(x)
     slope = gradient @ direction
     remainder = np.array([

@@ -70,7 +70,7 @@ def test_senseless_wishes_are_refused(wrong):
 @pytest.fixture(scope="module")
 def rough_walker():
     """The preview's walker with a random design, 250 steps of it, and its gradient."""
-    scene = walker(64, 8e-4).with_floors(1e-2, 1e-3)
+    scene = walker(64, 8e-4).vary(mass_floor=1e-2, stiffness_floor=1e-3)
     scene = type(scene)(**{**vars(scene), "steps": 250})
     problem = Problem(scene, beta=2.0)
     design = np.random.default_rng(3).uniform(-1.0, 1.0, problem.size - 3)
@@ -117,9 +117,7 @@ def test_the_scratch_file_is_removed_and_one_that_was_asked_for_is_kept(
             assert file[f"{index}/state"].dtype == np.float64
 
 
-def test_the_scratch_file_is_removed_when_the_simulation_fails(
-    rough_walker, tmp_path, monkeypatch
-):
+def test_the_scratch_file_is_removed_when_the_simulation_fails(rough_walker, tmp_path, monkeypatch):
     scene, x, _ = rough_walker
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
 

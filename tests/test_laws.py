@@ -149,7 +149,7 @@ def test_a_sliding_block_loses_friction_times_the_normal_impulse(friction):
 
 
 def manufactured_error(n, amplitude, courant=0.2, per_cell=2):
-    """Greatest rms error over half a period, in amplitudes, of the axis-aligned manufactured solution.
+    """Greatest rms error over half a period, in amplitudes, of the manufactured solution.
 
     u_i = A sin(pi X_i) sin(c pi t + phi_i) on the unit square between mirror walls, which fold what
     particles put on the ghost nodes back to the inside.

@@ -333,7 +333,7 @@ def test_agrees_with_an_independent_solver_on_a_random_convex_problem(globally_c
     assert result.fun == pytest.approx(other.fun, rel=1e-9)
     np.testing.assert_allclose(result.x, other.x, atol=1e-5)
     active = np.count_nonzero(result.multipliers > 1e-6)
-    assert 0 < active and np.any(np.abs(result.x) > 1 - 1e-9)
+    assert active > 0 and np.any(np.abs(result.x) > 1 - 1e-9)
 
 
 @VARIANTS

@@ -24,7 +24,7 @@ def x(problem, rng):
 
 
 def test_gradient_of_the_preview_walker_over_all_its_steps(rng):
-    problem = Problem(walker(64, 8e-4).with_floors(1e-2, 1e-3), beta=2.0)
+    problem = Problem(walker(64, 8e-4).vary(mass_floor=1e-2, stiffness_floor=1e-3), beta=2.0)
     x = problem.join(rng.uniform(-1.0, 1.0, problem.size - 3), 0.9, -0.3, -0.5)
     errors = complex_step_errors(problem, x)
     assert set(errors) == {

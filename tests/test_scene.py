@@ -82,7 +82,10 @@ C = 1 / 16
         (lambda: small_scene(body=(Design((3 * C, 4 * C), (6 * C, 6 * C)),)), ["objective"]),
         (lambda: small_scene(body=(Solid((0.0, 4 * C), (C, 5 * C)),)), ["0.0625", "0.9375"]),
         (lambda: small_scene(body=(Solid((4 * C, 5 * C), (5 * C, 0.99)),)), ["0.99", "0.9375"]),
-        (lambda: small_scene(body=(Solid((0.26, 4 * C), (0.5, 0.5)),)), ["0.26", "0.03125", "0.25"]),
+        (
+            lambda: small_scene(body=(Solid((0.26, 4 * C), (0.5, 0.5)),)),
+            ["0.26", "0.03125", "0.25"],
+        ),
         (
             lambda: small_scene(
                 body=(
@@ -118,15 +121,15 @@ def test_stability_limit_is_that_of_an_isolated_particle():
 
 
 def test_light_stiff_void_lowers_the_stability_limit(scene):
-    light = scene.with_floors(mass=1e-3, stiffness=2e-3)
+    light = scene.vary(mass_floor=1e-3, stiffness_floor=2e-3)
     assert light.largest_time_step == pytest.approx(scene.largest_time_step / math.sqrt(2.0))
 
 
 def test_another_time_step_keeps_the_duration(scene):
-    finer = scene.with_time_step(1e-3)
+    finer = scene.vary(time_step=1e-3)
     assert (finer.steps, finer.time_step) == (160, 1e-3)
     with pytest.raises(SceneError, match=r"0\.16 is no multiple of time_step = 0\.003"):
-        scene.with_time_step(3e-3)
+        scene.vary(time_step=3e-3)
 
 
 def test_a_scene_cannot_be_changed(scene):

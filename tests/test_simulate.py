@@ -4,7 +4,6 @@ import dataclasses
 
 import numpy as np
 import pytest
-from conftest import small_scene
 
 from mpmopt.errors import DesignError, SimulationError
 from mpmopt.particles import lay_out
@@ -102,5 +101,3 @@ def test_a_body_without_particles_is_refused(scene):
         Simulation(
             scene, nothing, np.zeros(0), np.zeros(0), np.zeros(0), np.zeros((scene.steps, 2))
         )
-
-
