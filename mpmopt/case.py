@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 import logging
-import os
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -94,7 +93,8 @@ def run(case: Case, out: Path, checkpointing: Checkpointing | None = None) -> di
         checkpointing,
     )
     summary = summarise(result, start)
-    _write_text(out / "summary.json", json.dumps(summary, indent=1) + "\n")
+    text = json.dumps(summary, indent=1) + "\n"
+    runfile.replace_file(out / "summary.json", text.encode())
     _draw(out, result, summary)
     return summary
 
@@ -143,16 +143,6 @@ def _draw(out: Path, result: Optimisation, summary: Mapping[str, Any]) -> None:
         out / "design.png", problem, best.x, f"Optimised design, L = {summary['optimised']:.3f}"
     )
     plot.plot_history(out / "history.png", result)
-
-
-def _write_text(path: Path, text: str) -> None:
-    """Write a text file that is complete or absent."""
-    new = path.with_name(f".{path.name}-new")
-    try:
-        new.write_text(text)
-        os.replace(new, path)
-    except OSError as error:
-        raise StorageError(f"cannot write {path}: {error}; make room") from error
 
 
 def table(summary: Mapping[str, Any]) -> str:

@@ -6,6 +6,7 @@ import math
 import os
 import shutil
 import tempfile
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -13,7 +14,7 @@ from typing import Literal
 
 import h5py
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from mpmopt.errors import DesignError, StorageError
 
@@ -128,70 +129,97 @@ class Schedule:
 
 
 class Checkpoints:
-    """HDF5 file of arrays by segment, made at once and removed at the end unless it was asked for.
+    """HDF5 file with room for arrays of every segment, removed at the end unless it was asked for.
+
+    All its room is taken before the first step: a disk that is full, or that fills up meanwhile,
+    costs no computed step, and HDF5, which does not survive it, never meets a write that fails.
 
     Parameters
     ----------
     schedule : Schedule
+    arrays : mapping of str to (shape, dtype)
+        What is stored of each segment. Dataset NAME has the shape (segments, *shape).
     store : "memory", "disk", Path or None
         As in `Checkpointing`; a Path is kept.
 
     Raises
     ------
     StorageError
-        If the file cannot be made or the disk has too little room for what will come.
+        If the file cannot be made or the disk has too little room.
     """
 
     def __init__(
-        self, schedule: Schedule, store: Path | Literal["memory", "disk"] | None = None
+        self,
+        schedule: Schedule,
+        arrays: Mapping[str, tuple[tuple[int, ...], DTypeLike]],
+        store: Path | Literal["memory", "disk"] | None = None,
     ) -> None:
         self.schedule = schedule
         self.path: Path | None = store if isinstance(store, Path) else None
         self._keep = self.path is not None
+        if schedule.in_memory:
+            self._file = h5py.File(
+                "checkpoints", "w", driver="core", backing_store=False, block_size=MEGABYTE
+            )
+            self._lay_out(arrays)
+            return
         try:
-            if schedule.in_memory:
-                self._file = h5py.File(
-                    "checkpoints", "w", driver="core", backing_store=False, block_size=MEGABYTE
-                )
-                return
             if self.path is None:
                 handle, name = tempfile.mkstemp(prefix="mpmopt-", suffix=".h5")
                 os.close(handle)
                 self.path = Path(name)
-            free = shutil.disk_usage(self.path.parent).free
-            if free < schedule.stored_bytes:
-                self._remove()
-                raise StorageError(
-                    f"checkpoints need {schedule.stored_bytes / MEGABYTE:.0f} MB but "
-                    f"{self.path.parent} has {free / MEGABYTE:.0f} MB free; store fewer states "
-                    "(Checkpointing.every), or put them elsewhere (Checkpointing.store, or the "
-                    "environment variable TMPDIR)"
-                )
-            self._file = h5py.File(self.path, "w")
+            sizes = (
+                np.dtype(dtype).itemsize * math.prod(shape) for shape, dtype in arrays.values()
+            )
+            size = len(schedule.segments) * sum(sizes) + MEGABYTE
+            self._take_room(size)  # twice, because HDF5 begins with an empty file
+            with h5py.File(self.path, "w") as self._file:
+                self._lay_out(arrays)
+            self._take_room(self.path.stat().st_size)
+            self._file = h5py.File(self.path, "r+")
         except OSError as error:
-            if isinstance(error, StorageError):
-                raise
             self._remove()
-            raise StorageError(f"cannot make the checkpoint file {self.path}: {error}") from error
-
-    def write(self, segment: int, **arrays: NDArray) -> None:
-        """Store named arrays of a segment."""
-        try:
-            for name, array in arrays.items():
-                self._file.create_dataset(f"{segment}/{name}", data=array, dtype=array.dtype)
-            self._file.flush()  # an error in writing what HDF5 holds back would pass unseen
-        except (OSError, RuntimeError) as error:
-            size = sum(array.nbytes for array in arrays.values())
             raise StorageError(
-                f"cannot store {size} bytes of segment {segment} in "
-                f"{self.path or 'memory'}: {error}; make room, or store fewer states "
-                "(Checkpointing.every)"
+                f"no room for checkpoints of {schedule.stored_bytes / MEGABYTE:.1f} MB in "
+                f"{self.path}: {error}; store fewer states (Checkpointing.every), or put them "
+                "elsewhere (Checkpointing.store, or the environment variable TMPDIR)"
             ) from error
 
+    def _lay_out(self, arrays: Mapping[str, tuple[tuple[int, ...], DTypeLike]]) -> None:
+        count = len(self.schedule.segments)
+        settings = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+        settings.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
+        settings.set_fill_time(h5py.h5d.FILL_TIME_NEVER)
+        for name, (shape, dtype) in arrays.items():
+            space = h5py.h5s.create_simple((count, *shape))
+            kind = h5py.h5t.py_create(np.dtype(dtype))
+            h5py.h5d.create(self._file.id, name.encode(), kind, space, dcpl=settings)
+
+    def _take_room(self, size: int) -> None:
+        assert self.path is not None
+        with self.path.open("ab") as file:
+            free = shutil.disk_usage(self.path.parent).free
+            if free < size:
+                raise OSError(f"{size / MEGABYTE:.1f} MB needed, {free / MEGABYTE:.1f} MB free")
+            if hasattr(os, "posix_fallocate"):
+                os.posix_fallocate(file.fileno(), 0, size)
+
+    def write(self, segment: int, **arrays: NDArray) -> None:
+        """Store named arrays of a segment; they may be shorter than the room for them."""
+        for name, array in arrays.items():
+            where = (segment, *map(slice, array.shape))
+            self._file[name][where] = array
+
     def read(self, segment: int, name: str) -> NDArray:
-        """An array of a segment, as it was written."""
+        """An array of a segment, with all the room that it has.
+
+        Raises
+        ------
+        StorageError
+            If the file lost it.
+        """
         try:
-            return np.asarray(self._file[f"{segment}/{name}"][()])
+            return np.asarray(self._file[name][segment])
         except (OSError, KeyError, RuntimeError) as error:
             raise StorageError(
                 f"cannot read {name} of segment {segment} back from {self.path or 'memory'}: "
@@ -199,21 +227,10 @@ class Checkpoints:
             ) from error
 
     def close(self) -> None:
-        """Close the store, and remove it unless it is to be kept.
-
-        Raises
-        ------
-        StorageError
-            If a file that is to be kept could not be completed.
-        """
-        try:
-            self._file.close()
-        except (OSError, RuntimeError) as error:
-            if self._keep:
-                raise StorageError(f"cannot complete {self.path}: {error}; make room") from error
-        finally:
-            if not self._keep:
-                self._remove()
+        """Close the store, and remove it unless it is to be kept."""
+        self._file.close()
+        if not self._keep:
+            self._remove()
 
     def _remove(self) -> None:
         if self.path is not None:
@@ -228,8 +245,4 @@ class Checkpoints:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        try:
-            self.close()
-        except StorageError:
-            if error is None:
-                raise
+        self.close()

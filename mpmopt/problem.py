@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpmopt.actuation import signal, signal_adjoint
-from mpmopt.checkpoints import Checkpointing, Checkpoints
+from mpmopt.checkpoints import Checkpointing
 from mpmopt.design import DesignChain
 from mpmopt.errors import DesignError, SimulationError
 from mpmopt.objective import Objective
@@ -135,8 +135,7 @@ class Problem:
         """
         phi, a, theta, _ = self.split(x)
         simulation = self.simulation(x)
-        schedule = simulation.schedule(self.checkpointing)
-        with Checkpoints(schedule, self.checkpointing.store) as checkpoints:
+        with simulation.checkpoints(self.checkpointing) as checkpoints:
             forward = simulation.forward(checkpoints)
             value = float(_finite(self.objective.value(forward.state), simulation))
             bars = forward.reverse(self.objective.seed(forward.state))

@@ -58,15 +58,28 @@ class RunFile:
     designs: dict[int, NDArray[np.float64]]
     stop_reason: str
 
-    def problem(self, stage: int | None = None) -> Problem:
-        """The problem that a stage solved, by default that of the best design."""
-        chosen = self.settings.stages[max(self.designs) if stage is None else stage]
-        return Problem(chosen.scene(self.scene), chosen.beta)
+    @property
+    def best_stage(self) -> int:
+        """The last stage that had a design.
+
+        Raises
+        ------
+        RunFileError
+            If none had: the run failed or was stopped before its first evaluation.
+        """
+        if not self.designs:
+            raise RunFileError("the run file holds no design: no evaluation succeeded")
+        return max(self.designs)
 
     @property
     def best(self) -> NDArray[np.float64]:
         """The best design: that of the last stage that had one."""
-        return self.designs[max(self.designs)]
+        return self.designs[self.best_stage]
+
+    def problem(self, stage: int | None = None) -> Problem:
+        """The problem that a stage solved, by default that of the best design."""
+        chosen = self.settings.stages[self.best_stage if stage is None else stage]
+        return Problem(chosen.scene(self.scene), chosen.beta)
 
 
 def write(path: Path, run: Optimisation) -> None:
@@ -77,22 +90,40 @@ def write(path: Path, run: Optimisation) -> None:
     StorageError
         If the file cannot be written; an older one is still whole.
     """
-    handle, name = -1, ""
+    # HDF5 does not survive a write that fails, so it writes to memory only.
+    with h5py.File("run", "w", driver="core", backing_store=False) as file:
+        _fill(file, run)
+        file.flush()
+        image = file.id.get_file_image()
+    replace_file(path, image)
+
+
+def replace_file(path: Path, content: bytes) -> None:
+    """Write a file that is complete or absent; an older one stays until the new one is complete.
+
+    Raises
+    ------
+    StorageError
+        If it cannot be written.
+    """
+    new = None
     try:
         handle, name = tempfile.mkstemp(prefix=f".{path.name}-", dir=path.parent)
-        os.close(handle)
-        with h5py.File(name, "w") as file:
-            _fill(file, run)
-        with Path(name).open("rb") as written:
-            os.fsync(written.fileno())
-        Path(name).chmod(0o644)
-        os.replace(name, path)
-    except (OSError, RuntimeError) as error:
-        if name:
-            Path(name).unlink(missing_ok=True)
+        new = Path(name)
+        with os.fdopen(handle, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        new.chmod(0o644)
+        os.replace(new, path)
+    except OSError as error:
         raise StorageError(
-            f"cannot write {path}: {error}; make room or choose another folder"
+            f"cannot write {len(content)} bytes to {path}: {error}; make room or choose another "
+            "folder"
         ) from error
+    finally:
+        if new is not None:
+            new.unlink(missing_ok=True)
 
 
 def _fill(file: h5py.File, run: Optimisation) -> None:
@@ -177,5 +208,5 @@ def read(path: Path) -> RunFile:
 def _numbers(file: h5py.File, name: str) -> NDArray[np.float64]:
     dataset = file[name]
     if not isinstance(dataset, h5py.Dataset) or dataset.dtype != np.float64 or dataset.ndim != 1:
-        raise RunFileError(f"{name} is no column of 64-bit numbers")
+        raise ValueError(f"{name} is no column of 64-bit numbers")
     return np.asarray(dataset[:], dtype=float)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from mpmopt import mpm
 from mpmopt.checkpoints import Checkpointing, Checkpoints, Schedule
@@ -175,12 +175,27 @@ class Simulation:
         """Number of steps."""
         return self.scene.steps
 
-    def schedule(self, wish: Checkpointing) -> Schedule:
-        """The checkpoint schedule that `value_and_gradient`'s loops will follow."""
+    def checkpoints(self, wish: Checkpointing) -> Checkpoints:
+        """A store for `forward`, with the schedule that the wish and the body's size ask for.
+
+        Raises
+        ------
+        StorageError
+            If the disk has too little room.
+        """
+        state, dtype = self.initial.shape, self.initial.dtype
         nodes = _capacity(self)
-        itemsize = self.initial.itemsize
-        step_bytes = (self.initial.size + mpm.NODE_SIZE * nodes) * itemsize
-        return Schedule.choose(self.steps, step_bytes, wish)
+        step_bytes = (self.initial.size + mpm.NODE_SIZE * nodes) * dtype.itemsize
+        schedule = Schedule.choose(self.steps, step_bytes, wish)
+        length = schedule.segment
+        arrays: dict[str, tuple[tuple[int, ...], DTypeLike]] = {"state": (state, dtype)}
+        if schedule.all_stored:
+            arrays = {
+                "states": ((length + 1, *state), dtype),
+                "grids": ((length, nodes, mpm.NODE_SIZE), dtype),
+                "windows": ((length, 4), np.int64),
+            }
+        return Checkpoints(schedule, arrays, wish.store)
 
     def forward(self, checkpoints: Checkpoints) -> Forward:
         """Run forward, storing what the checkpoints' schedule asks for.
@@ -189,8 +204,6 @@ class Simulation:
         ------
         SimulationError
             As `run`.
-        StorageError
-            If a checkpoint cannot be written.
         """
         schedule = checkpoints.schedule
         memory = _Segment(self, schedule.segment)
@@ -201,9 +214,7 @@ class Simulation:
             memory.advance(first, last)
             if last < schedule.steps:
                 if schedule.all_stored:
-                    checkpoints.write(
-                        index, states=memory.states, grids=memory.grids, windows=memory.windows
-                    )
+                    memory.store(index, checkpoints)
                 memory.states[0] = memory.states[last - first]
         return Forward(self, checkpoints, memory)
 
@@ -217,6 +228,7 @@ class _Segment:
         self.states = np.empty((length + 1, mpm.STATE_SIZE, count), dtype)
         self.windows = np.zeros((length, 4), np.int64)
         self.grids = np.empty((length, 0, mpm.NODE_SIZE), dtype)
+        self.recomputed: set[int] = set()  # segments whose windows outgrew their room in the store
         self._affine, self._log_J = np.empty((4, count), dtype), np.empty(count, dtype)
         self.resize(_capacity(simulation))
 
@@ -257,6 +269,30 @@ class _Segment:
                 state = self.states[reached % len(self.states)]
                 raise _failure(simulation, end, first + reached, particle, state)
 
+    def store(self, index: int, checkpoints: Checkpoints) -> None:
+        """Store the whole segment, or only its states if its windows outgrew their room."""
+        used = int((self.windows[:, 2] * self.windows[:, 3]).max())
+        if used > _capacity(self.simulation):
+            self.recomputed.add(index)
+            checkpoints.write(index, states=self.states)
+        else:
+            grids = self.grids[:, :used]
+            checkpoints.write(index, states=self.states, grids=grids, windows=self.windows)
+
+    def recall(self, index: int, first: int, last: int, checkpoints: Checkpoints) -> None:
+        """Bring the states and nodes of a segment back: read them, or recompute them."""
+        if not checkpoints.schedule.all_stored:
+            self.states[0] = checkpoints.read(index, "state")
+            self.advance(first, last)
+            return
+        self.states[:] = checkpoints.read(index, "states")
+        if index in self.recomputed:
+            self.advance(first, last)
+        else:
+            self.windows[:] = checkpoints.read(index, "windows")
+            grids = checkpoints.read(index, "grids")
+            self.grids[:, : grids.shape[1]] = grids
+
 
 class Forward:
     """A forward run that is ready to be gone back through.
@@ -271,6 +307,14 @@ class Forward:
         self._simulation, self._checkpoints, self._memory = simulation, checkpoints, memory
         first, last = checkpoints.schedule.segments[-1]
         self.state = memory.states[last - first].copy()
+
+    @property
+    def recomputed_segments(self) -> int:
+        """Segments that `reverse` recomputes."""
+        schedule = self._checkpoints.schedule
+        if schedule.all_stored:
+            return len(self._memory.recomputed)
+        return len(schedule.segments) - 1
 
     def reverse(self, seed: NDArray[np.float64]) -> Gradient:
         """Go back through all steps from `seed`, the objective's derivative by the final state.
@@ -289,7 +333,7 @@ class Forward:
         for index in range(len(segments) - 1, -1, -1):
             first, last = segments[index]
             if last < schedule.steps:
-                self._recall(index, first, last)
+                memory.recall(index, first, last, self._checkpoints)
             for stop in range(last - first, 0, -STEPS_PER_CALL):
                 mpm.advance_adjoint(
                     memory.states,
@@ -312,18 +356,6 @@ class Forward:
             signal=signal_bar,
             state=bar,
         )
-
-    def _recall(self, index: int, first: int, last: int) -> None:
-        """Bring the states and nodes of a segment back into memory."""
-        memory, checkpoints = self._memory, self._checkpoints
-        if checkpoints.schedule.all_stored:
-            grids = checkpoints.read(index, "grids")
-            memory.states[:] = checkpoints.read(index, "states")
-            memory.windows[:] = checkpoints.read(index, "windows")
-            memory.grids[:, : grids.shape[1]] = grids
-        else:
-            memory.states[0] = checkpoints.read(index, "state")
-            memory.advance(first, last)
 
 
 def _capacity(simulation: Simulation) -> int:

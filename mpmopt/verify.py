@@ -131,10 +131,10 @@ class _Bench:
         self.objective = Objective.of(self.particles, scene.direction)
         count = len(self.particles.position)
         dx = scene.grid.dx
-        # Fast enough to hit walls and to slide on them, and well deformed, but not inverted.
+        # Scattered, hitting walls and sliding on them, well deformed but not inverted.
         speed = dx / scene.time_step
         self.state: NDArray = np.zeros((mpm.STATE_SIZE, count))
-        self.state[0:2] = self.particles.position.T
+        self.state[0:2] = self.particles.position.T + 0.5 * dx * rng.uniform(-1.0, 1.0, (2, count))
         self.state[2:4] = 0.1 * speed * rng.standard_normal((2, count))
         self.state[4:8] = 0.1 / scene.time_step * rng.uniform(-1.0, 1.0, (4, count))
         self.state[8:12] = 0.2 * rng.uniform(-1.0, 1.0, (4, count))

@@ -1,0 +1,166 @@
+"""Stages, stop rule, the best design, and evaluations that fail."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from conftest import small_scene
+
+from mpmopt.errors import DesignError, SceneError, SimulationError
+from mpmopt.optimize import Settings, Stage, optimise
+from mpmopt.problem import Problem
+
+STAGES = (Stage(0.5, 1e-2, 1e-3, 4e-3), Stage(2.0, 5e-3, 1e-3, 2e-3, solid=True))
+QUICK = Settings(STAGES, least_iterations=12, most_iterations=15)
+
+
+@pytest.fixture
+def scene():
+    return small_scene(steps=60, gravity=(0.0, -10.0))
+
+
+@pytest.fixture
+def start(scene):
+    return Problem(scene).join(0.0, 1.0, -0.3, -0.5)
+
+
+def fail_on(monkeypatch, numbers):
+    """Let the evaluations of these numbers fail, and count all."""
+    calls = []
+    real = Problem.value_and_gradient
+
+    def value_and_gradient(self, x):
+        calls.append((self.scene.time_step, x.copy()))
+        if len(calls) - 1 in numbers:
+            raise SimulationError("made to fail", 3, 1, (0.0, 0.0), "none")
+        return real(self, x)
+
+    monkeypatch.setattr(Problem, "value_and_gradient", value_and_gradient)
+    return calls
+
+
+def test_an_optimisation_goes_farther_and_remembers_how(scene, start):
+    seen = []
+    run = optimise(scene, QUICK, start, [lambda run: seen.append(len(run.history))])
+    assert seen == [*range(1, len(run.history) + 1), len(run.history)]  # and once at the end
+    first = run.history[0]
+    assert first.objective == Problem(STAGES[0].scene(scene), 0.5).value(start)
+    assert run.best[0].objective > first.objective + 1e-3
+    assert run.failed_evaluations == 0
+    assert {item.stage for item in run.history} == {0, 1}
+    assert next(item.beta for item in run.history if item.stage == 1) == 2.0
+    assert run.stop_reason.startswith("Stage 2 of 2 was the last: ")
+    for item in run.history:
+        assert np.abs(item.x).max() <= 1.0
+        assert item.step <= QUICK.move_limit + 1e-12
+
+
+def test_the_best_design_is_the_stages_best_and_reproduces_its_value(scene, start):
+    run = optimise(scene, QUICK, start)
+    first = [item for item in run.history if item.stage == 0]
+    assert run.best[0].objective == max(item.objective for item in first)
+    last = [item for item in run.history if item.stage == 1]
+    assert run.result.post_processed == max(item.post_processed for item in last)
+    problem = Problem(STAGES[1].scene(scene), 2.0)
+    assert problem.value(run.result.x) == run.result.objective
+    assert run.result.gamma == pytest.approx(problem.gamma(run.result.x), abs=0.0)
+
+
+def test_each_stage_starts_from_the_last_ones_best(scene, start):
+    run = optimise(scene, QUICK, start)
+    second = next(item for item in run.history if item.stage == 1)
+    assert np.array_equal(second.x, run.best[0].x)
+    on = dataclasses.replace(QUICK, best_first=False)
+    run = optimise(scene, on, start)
+    last_of_first = [item for item in run.history if item.stage == 0][-1]
+    second = next(item for item in run.history if item.stage == 1)
+    assert np.array_equal(second.x, last_of_first.x)
+
+
+def test_the_moving_average_ends_a_stage(scene, start):
+    still = Settings(STAGES[:1], tolerance=1.0, least_iterations=13, most_iterations=100)
+    run = optimise(scene, still, start)
+    assert len(run.history) == 13
+    assert "mean objective over 10 iterations changed by" in run.stop_reason
+    assert "after 13 of them" in run.stop_reason
+    never = dataclasses.replace(still, tolerance=0.0, most_iterations=17)
+    run = optimise(scene, never, start)
+    assert len(run.history) == 17
+    assert "limit of 17 iterations" in run.stop_reason
+
+
+def test_a_failure_goes_back_to_the_best_design_and_shortens_the_move(scene, start, monkeypatch):
+    fail_on(monkeypatch, {5})
+    run = optimise(scene, dataclasses.replace(QUICK, stages=STAGES[:1]), start)
+    assert run.failed_evaluations == 1
+    failed, after = run.history[5], run.history[6]
+    assert np.isnan(failed.objective)
+    assert "made to fail" in failed.failure
+    best = max(run.history[:5], key=lambda item: item.objective)
+    assert after.move_limit <= failed.move_limit / 2
+    assert np.abs(after.x - best.x).max() <= 2.0 * after.move_limit + 1e-12
+    assert np.isfinite(after.objective)
+    assert len(run.history) == QUICK.most_iterations + 1
+
+
+def test_a_stage_whose_first_design_fails_halves_its_step(scene, start, monkeypatch):
+    calls = fail_on(monkeypatch, {0, 1})
+    run = optimise(scene, dataclasses.replace(QUICK, stages=STAGES[:1]), start)
+    assert [step for step, _ in calls[:3]] == [4e-3, 2e-3, 1e-3]
+    assert all(np.array_equal(x, start) for _, x in calls[:3])
+    assert run.result.time_step == 1e-3
+    assert run.failed_evaluations == 2
+
+
+def test_repeated_failure_gives_up_with_everything_kept(scene, start, monkeypatch):
+    fail_on(monkeypatch, set(range(6, 1000)))
+    run = optimise(scene, dataclasses.replace(QUICK, most_failures=4), start)
+    assert len(run.history) == 10
+    assert run.failed_evaluations == 4
+    assert "gave up after 4 failed evaluations in a row" in run.stop_reason
+    assert run.stop_reason.startswith("Stage 1 of 2 was the last")
+    assert run.result.objective == max(item.objective for item in run.history[:6])
+
+
+def test_failure_from_the_start_is_an_error_that_can_be_read(scene, start, monkeypatch):
+    fail_on(monkeypatch, set(range(1000)))
+    run = optimise(scene, dataclasses.replace(QUICK, most_failures=3), start)
+    assert "gave up after 3" in run.stop_reason
+    with pytest.raises(SimulationError, match="every evaluation failed"):
+        _ = run.result
+
+
+def test_a_stage_that_cannot_run_is_refused_before_any_evaluation(scene, start, monkeypatch):
+    calls = fail_on(monkeypatch, set())
+    too_light = dataclasses.replace(STAGES[1], mass_floor=1e-5)
+    with pytest.raises(SceneError, match="stability limit"):
+        optimise(scene, dataclasses.replace(QUICK, stages=(STAGES[0], too_light)), start)
+    assert calls == []
+
+
+def test_a_start_that_does_not_fit_is_refused(scene):
+    with pytest.raises(DesignError, match="variables"):
+        optimise(scene, QUICK, np.zeros(3))
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"stages": ()},
+        {"window": 0},
+        {"least_iterations": 300},
+        {"move_limit": 0.0},
+        {"move_limit": 1.5},
+        {"tolerance": -1.0},
+        {"most_failures": 0},
+    ],
+)
+def test_senseless_settings_are_refused(wrong):
+    with pytest.raises(DesignError, match=next(iter(wrong))):
+        dataclasses.replace(QUICK, **wrong)
+
+
+def test_the_same_start_gives_the_same_run_bit_for_bit(scene, start):
+    one, two = (optimise(scene, QUICK, start) for _ in range(2))
+    assert [item.objective for item in one.history] == [item.objective for item in two.history]
+    assert np.array_equal(one.result.x, two.result.x)

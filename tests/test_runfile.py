@@ -1,0 +1,172 @@
+"""The file that a run leaves: complete, readable, or refused."""
+
+import dataclasses
+import resource
+import subprocess
+import sys
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from conftest import small_scene
+
+from mpmopt import runfile
+from mpmopt.errors import RunFileError, StorageError
+from mpmopt.optimize import Settings, Stage, optimise
+from mpmopt.problem import Problem
+
+STAGES = (Stage(0.5, 1e-2, 1e-3, 4e-3), Stage(2.0, 5e-3, 1e-3, 4e-3, solid=True))
+
+
+@pytest.fixture(scope="module")
+def run():
+    scene = small_scene(steps=20)
+    settings = Settings(STAGES, window=2, least_iterations=3, most_iterations=4)
+    return optimise(scene, settings, Problem(scene).join(0.0, 1.0, -0.3, -0.5))
+
+
+@pytest.fixture
+def path(run, tmp_path):
+    path = tmp_path / "run.h5"
+    runfile.write(path, run)
+    return path
+
+
+def test_a_run_is_read_back_as_it_was(run, path):
+    back = runfile.read(path)
+    assert back.scene == run.scene
+    assert back.settings == run.settings
+    assert back.stop_reason == run.stop_reason
+    assert set(back.versions) == {"mpmopt", "python", "numba", "numpy", "scipy", "h5py"}
+    for name in runfile.COLUMNS:
+        column = [getattr(item, name) for item in run.history]
+        assert np.array_equal(back.history[name], column, equal_nan=True)
+    assert list(back.history["failure"]) == [item.failure for item in run.history]
+    assert set(back.designs) == {0, 1}
+    for stage, item in run.best.items():
+        assert np.array_equal(back.designs[stage], item.x)
+    assert back.problem().value(back.best) == run.result.objective
+    assert back.problem(0).value(back.designs[0]) == run.best[0].objective
+
+
+def test_the_best_design_is_there_by_name(run, path):
+    with h5py.File(path) as file:
+        best = {name: values[()] for name, values in file["best"].items()}
+    assert np.array_equal(np.concatenate([best[k] for k in ("phi", "a", "theta", "b")]),
+                          run.result.x)  # fmt: skip
+    assert np.array_equal(best["gamma"], run.result.gamma)
+    assert all(values.dtype == np.float64 for values in best.values())
+
+
+def test_an_unfinished_run_can_be_read(run, tmp_path):
+    path = tmp_path / "run.h5"
+    runfile.write(path, dataclasses.replace(run, history=run.history[:1], best={}, stop_reason=""))
+    back = runfile.read(path)
+    assert back.designs == {}
+    assert back.stop_reason == ""
+    with pytest.raises(RunFileError, match="no design"):
+        _ = back.best
+
+
+def test_writing_again_replaces_the_file_and_leaves_nothing_else(run, path):
+    runfile.write(path, run)
+    assert [file.name for file in path.parent.iterdir()] == ["run.h5"]
+
+
+def damaged(path, change):
+    with h5py.File(path, "r+") as file:
+        change(file)
+    return path
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda f: f.attrs.update(format="other"),
+        lambda f: f.attrs.update(version=99),
+        lambda f: f.attrs.update(scene="{}"),
+        lambda f: f.attrs.update(scene="no JSON"),
+        lambda f: f.attrs.update(settings="[]"),
+        lambda f: f.attrs.update(settings='{"stages": []}'),
+        lambda f: f.attrs.update(settings='{"stages": [], "speed": 3}'),
+        lambda f: f.attrs.pop("settings"),
+        lambda f: f.pop("history/objective"),
+        lambda f: f.create_group("stages/x"),
+        lambda f: f["stages/0"].pop("x"),
+        lambda f: (f["stages/0"].pop("x"), f.create_dataset("stages/0/x", data=["a"])),
+        lambda f: (f["history"].pop("beta"), f.create_dataset("history/beta", data=[[1.0]])),
+    ],
+)
+def test_a_damaged_run_file_is_refused(path, change):
+    with pytest.raises(RunFileError, match=r"run\.h5"):
+        runfile.read(damaged(path, change))
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.9, 0.999])
+def test_a_truncated_run_file_is_refused(path, share):
+    data = path.read_bytes()
+    path.write_bytes(data[: int(share * len(data))])
+    with pytest.raises(RunFileError, match=r"run\.h5"):
+        runfile.read(path)
+
+
+def test_what_is_no_run_file_is_refused(tmp_path):
+    with pytest.raises(RunFileError, match="not there"):
+        runfile.read(tmp_path / "run.h5")
+    text = tmp_path / "text.h5"
+    text.write_text("not HDF5")
+    with pytest.raises(RunFileError):
+        runfile.read(text)
+    with h5py.File(tmp_path / "other.h5", "w") as file:
+        file["x"] = 1.0
+    with pytest.raises(RunFileError, match="no run file"):
+        runfile.read(tmp_path / "other.h5")
+
+
+@pytest.mark.skipif(not hasattr(resource, "RLIMIT_FSIZE"), reason="needs a file-size limit")
+def test_a_full_disk_loses_nothing_that_was_written(run, path):
+    before = path.read_bytes()
+    limit = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (6000, limit[1]))
+    try:
+        with pytest.raises(StorageError, match="make room"):
+            runfile.write(path, run)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limit)
+    assert path.read_bytes() == before
+    assert [file.name for file in path.parent.iterdir()] == ["run.h5"]
+
+
+def test_a_folder_that_is_not_there_is_a_storage_error(run, tmp_path):
+    with pytest.raises(StorageError, match="nowhere"):
+        runfile.write(tmp_path / "nowhere" / "run.h5", run)
+
+
+def command(*arguments):
+    """``python -m mpmopt`` as a process of its own."""
+    return subprocess.run(
+        [sys.executable, "-m", "mpmopt", *map(str, arguments)],
+        capture_output=True, text=True, timeout=120, cwd=Path(__file__).parent.parent,
+    )  # fmt: skip
+
+
+def test_verify_prints_its_checks_and_passes(path):
+    done = command("verify", path)
+    assert done.returncode == 0, done.stderr
+    lines = done.stdout.splitlines()
+    assert lines[-1] == f"{len(lines) - 1} of {len(lines) - 1} checks passed"
+    for name in ("dot product: p2g", "complex step: phi along direction 0", "Taylor order"):
+        assert any(line.startswith(name) for line in lines)
+
+
+def test_verify_of_no_run_file_says_so_and_fails(tmp_path):
+    done = command("verify", tmp_path / "run.h5")
+    assert done.returncode == 1
+    assert done.stderr.startswith("RunFileError: ")
+    assert "Traceback" not in done.stderr
+
+
+def test_an_unknown_command_is_not_understood():
+    assert command("fly").returncode == 2
+    assert "verify" in command("--help").stdout

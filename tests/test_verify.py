@@ -1,0 +1,93 @@
+"""The checks pass what is right, and fail what is wrong."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import small_scene
+
+from mpmopt.problem import Problem
+from mpmopt.verify import contact_free, dot_product_mismatch, report, taylor_test
+
+ROOT = Path(__file__).parent.parent
+
+
+def test_a_report_passes_on_a_rough_scene(rng):
+    scene = small_scene()
+    problem = Problem(scene, beta=2.0)
+    x = problem.join(rng.uniform(-1.0, 1.0, 32), [0.9, 0.5], [-0.3, 0.2], [-0.5, 0.1])
+    checks = report(problem, x)
+    assert {check.name.split(":")[0] for check in checks} == {
+        "dot product", "complex step", "Taylor order, contact-free",
+    }  # fmt: skip
+    assert [check for check in checks if not check.passed] == []
+
+
+def test_taylor_remainders_fall_with_the_square_of_the_step(rng):
+    problem = Problem(contact_free(small_scene()))
+    x = problem.join(rng.uniform(-0.5, 0.5, 32), [0.6, 0.5], [-0.3, 0.2], [-0.5, 0.1])
+    taylor = taylor_test(problem, x, rng.uniform(-1.0, 1.0, x.size))
+    assert taylor.order == pytest.approx(2.0, abs=0.1)
+    assert np.all(np.diff(taylor.remainder) < 0.0)
+
+
+def test_contact_free_windows_touch_nothing():
+    scene = contact_free(small_scene(), steps=10)
+    assert (scene.walls, scene.gravity, scene.steps) == ((), (0.0, 0.0), 10)
+
+
+def test_dot_product_of_a_known_matrix(rng):
+    matrix = rng.standard_normal((3, 4))
+
+    def mismatch(adjoint):
+        return dot_product_mismatch(
+            lambda v: {"y": matrix @ v["x"]},
+            lambda v, w: {"x": adjoint @ w["y"]},
+            {"x": rng.standard_normal(4)},
+            rng,
+        )
+
+    assert mismatch(matrix.T) <= 1e-15
+    assert mismatch(matrix.T + 1e-9) >= 1e-12
+
+
+def without_jit(*arguments, **more):
+    """A Python process with the JIT switched off."""
+    environment = {**os.environ, "NUMBA_DISABLE_JIT": "1", "PYTHONPATH": f"{ROOT}:{ROOT}/cases"}
+    return subprocess.run(
+        [sys.executable, *arguments],
+        capture_output=True, text=True, cwd=ROOT, env=environment, timeout=300, **more,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def verdicts():
+    done = without_jit(ROOT / "tests" / "wrong_adjoints.py")
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+def test_the_right_adjoint_passes_all_checks(verdicts):
+    assert verdicts["nothing"] == {"dot": True, "complex step": True, "Taylor": True}
+
+
+def test_every_wrong_adjoint_fails_every_check_that_can_see_it(verdicts):
+    wrong = {name: verdict for name, verdict in verdicts.items() if name != "nothing"}
+    assert len(wrong) >= 15
+    # Taylor's window has no walls.
+    assert wrong.pop("wall forgotten") == {"dot": False, "complex step": False, "Taylor": True}
+    passed = {
+        name: [check for check, ok in verdict.items() if ok]
+        for name, verdict in wrong.items()
+        if any(verdict.values())
+    }
+    assert passed == {}
+
+
+def test_kernels_behave_the_same_without_the_jit():
+    done = without_jit("-m", "pytest", "-q", "-p", "no:cacheprovider", "tests/test_mpm.py")
+    assert done.returncode == 0, done.stdout
