@@ -184,7 +184,7 @@ def test_windows_that_outgrow_the_store_are_recomputed():
         ones = np.ones(48)
         state = np.zeros((12, 48))
         state[0:2] = particles.position.T
-        state[2:4] = [[8.0], [11.0]] * (state[0:2] - state[0:2].mean(axis=1, keepdims=True))
+        state[2:4] = [[9.0], [14.0]] * (state[0:2] - state[0:2].mean(axis=1, keepdims=True))
         state[[8, 11]] = 1.0
         weak = 1e-9 * ones
         simulation = Simulation(scene, particles, ones, weak, weak, np.zeros((40, 2)), state)

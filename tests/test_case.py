@@ -1,0 +1,145 @@
+"""A case from start to end, small: what it leaves in its folder."""
+
+import dataclasses
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from walker import CASES, walker
+
+from mpmopt import runfile
+from mpmopt.case import Case, ProgressBar, main, run
+from mpmopt.errors import StorageError
+from mpmopt.optimize import Settings, Stage, optimise
+from mpmopt.problem import Problem
+
+SMALL = Case(
+    walker(64, 8e-4),
+    Settings(
+        (Stage(0.5, 1e-2, 1e-3, 8e-4), Stage(8.0, 1e-2, 1e-3, 8e-4, solid=True)),
+        least_iterations=12,
+        most_iterations=15,
+    ),
+)
+ROOT = Path(__file__).parent.parent
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    out = tmp_path_factory.mktemp("case") / "new" / "walker"
+    return out, run(SMALL, out)
+
+
+def test_a_small_walker_walks_even_without_its_void(folder):
+    _, summary = folder
+    assert summary["start"] == pytest.approx(13 / 64, abs=1e-9)
+    assert summary["reference"] == pytest.approx(13 / 64, abs=1e-3)  # a full block stays
+    assert summary["optimised"] - summary["reference"] >= 0.05
+    assert summary["post_processed"] - summary["reference"] >= 0.03
+    assert summary["failed_evaluations"] == 0
+    assert summary["evaluations"] <= 30
+
+
+def test_the_folder_holds_run_summary_and_pictures(folder):
+    out, summary = folder
+    names = {path.name for path in out.iterdir()}
+    assert names == {"run.h5", "summary.json", "design.png", "history.png"}
+    assert json.loads((out / "summary.json").read_text()) == summary
+    assert set(summary) >= {
+        "start", "reference", "optimised", "post_processed", "a", "theta", "b",
+        "evaluations", "failed_evaluations", "seconds", "stop_reason",
+    }  # fmt: skip
+    for picture in ("design.png", "history.png"):
+        data = (out / picture).read_bytes()
+        assert data.startswith(b"\x89PNG")
+        assert len(data) >= 20_000
+    kept = runfile.read(out / "run.h5")
+    assert kept.scene == SMALL.scene
+    assert kept.stop_reason == summary["stop_reason"]
+    assert kept.problem().value(kept.best) == summary["optimised"]
+
+
+def test_an_earlier_run_is_never_overwritten(folder):
+    out, _ = folder
+    before = (out / "run.h5").read_bytes()
+    with pytest.raises(StorageError, match="earlier run"):
+        run(SMALL, out)
+    assert (out / "run.h5").read_bytes() == before
+
+
+def test_a_folder_that_cannot_be_made_is_a_storage_error(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(StorageError, match="cannot make"):
+        run(SMALL, tmp_path / "file" / "folder")
+
+
+def test_the_command_prints_the_summary_or_an_error(tmp_path, capsys):
+    tiny = Case(
+        dataclasses.replace(SMALL.scene, steps=10),
+        Settings(SMALL.settings.stages[:1], window=1, least_iterations=2, most_iterations=2),
+    )
+    assert (
+        main("A case.", {"default": SMALL, "tiny": tiny}, ["--tiny", "--out", str(tmp_path)]) == 0
+    )
+    printed = capsys.readouterr().out.splitlines()
+    assert printed[0].split() == ["start", "0.2031"]
+    assert printed[-1].startswith("stop reason  ")
+    assert (
+        main("A case.", {"default": SMALL, "tiny": tiny}, ["--tiny", "--out", str(tmp_path)]) == 1
+    )
+    assert capsys.readouterr().err.startswith("StorageError: ")
+
+
+def test_progress_becomes_log_lines_off_a_terminal(capsys):
+    settings = Settings(SMALL.settings.stages[:1], window=1, most_iterations=20, tolerance=0.0)
+    scene = dataclasses.replace(SMALL.scene, steps=10)
+    start = Problem(scene).join(0.0, 1.0, -0.3, -0.5)
+    optimise(scene, settings, start, [ProgressBar()])
+    lines = capsys.readouterr().err.splitlines()
+    assert [line.split()[0] for line in lines] == ["10", "20"]
+    assert "greyness" in lines[0]
+
+
+def test_the_walkers_settings_are_those_of_the_design():
+    preview, default, paper = (CASES[name] for name in ("preview", "default", "paper"))
+    assert (preview.scene.grid.cells[0], preview.scene.time_step) == (64, 8e-4)
+    assert (default.scene.grid.cells[0], default.scene.time_step) == (128, 5e-4)
+    assert {(s.mass_floor, s.stiffness_floor) for s in default.settings.stages} == {(1e-2, 1e-3)}
+    assert (paper.scene.grid.cells[0], paper.scene.steps) == (128, 5000)
+    assert {(s.mass_floor, s.stiffness_floor) for s in paper.settings.stages} == {(1e-3, 1e-3)}
+    assert [s.beta for s in paper.settings.stages] == [0.5, 1.0, 2.0, 4.0, 8.0, 16.0]
+    for case in CASES.values():
+        for stage in case.settings.stages:
+            stage.scene(case.scene)
+
+
+def start_up(tmp_path, what):
+    environment = {**os.environ, "PYTHONPATH": f"{ROOT}:{ROOT}/cases"}
+    done = subprocess.run(
+        [sys.executable, "-c", what], capture_output=True, text=True, env=environment,
+        timeout=120, cwd=tmp_path,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return done.stdout.split()
+
+
+def test_importing_the_package_imports_nothing_heavy(tmp_path):
+    modules = start_up(
+        tmp_path, "import sys, mpmopt; from mpmopt import scene; print(*sys.modules)"
+    )
+    assert not {"numba", "scipy", "h5py", "matplotlib"} & set(modules)
+
+
+def test_a_second_start_takes_its_kernels_from_the_cache(tmp_path):
+    program = (
+        "from walker import walker; from mpmopt import mpm; from mpmopt.problem import Problem\n"
+        "p = Problem(walker(64, 8e-4)); p.value_and_gradient(p.join(0.0, 1.0, -0.3, -0.5))\n"
+        "print(sum(mpm.advance.stats.cache_hits.values()),"
+        " sum(mpm.advance.stats.cache_misses.values()),"
+        " sum(mpm.advance_adjoint.stats.cache_hits.values()))"
+    )
+    start_up(tmp_path, program)
+    assert start_up(tmp_path, program) == ["1", "0", "1"]
