@@ -6,7 +6,7 @@ import argparse
 import json
 import logging
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -101,16 +101,14 @@ def run(case: Case, out: Path, checkpointing: Checkpointing | None = None) -> di
 
 def summarise(result: Optimisation, start: np.ndarray) -> dict[str, Any]:
     """Objective values (L, larger is farther), actuation and counts of a finished optimisation."""
-    best = result.result
-    stage = result.settings.stages[best.stage]
-    problem = Problem(stage.scene(result.scene).vary(time_step=best.time_step), stage.beta)
+    best, problem = result.result, result.problem()
     actuation = problem.split(best.x)
 
     def numbers(values: np.ndarray) -> float | list[float]:
         return float(values[0]) if values.size == 1 else values.tolist()
 
     return {
-        "start": result.history[0].objective,
+        "start": _value_or_none(lambda: result.history[0].objective),
         "reference": _value_or_none(lambda: full_block(problem, start, best.x)),
         "optimised": best.objective,
         "post_processed": _value_or_none(lambda: post_processed(problem, best.x)),
@@ -125,23 +123,21 @@ def summarise(result: Optimisation, start: np.ndarray) -> dict[str, Any]:
     }
 
 
-def _value_or_none(value: Any) -> float | None:
+def _value_or_none(function: Callable[[], float]) -> float | None:
+    """A value for the summary, null in JSON if there is none."""
     try:
-        return float(value())
+        value = function()
     except SimulationError as error:
         logging.getLogger(__name__).warning("no value: %s", error)
         return None
+    return value if np.isfinite(value) else None
 
 
 def _draw(out: Path, result: Optimisation, summary: Mapping[str, Any]) -> None:
     from mpmopt import plot
 
-    best = result.result
-    stage = result.settings.stages[best.stage]
-    problem = Problem(stage.scene(result.scene).vary(time_step=best.time_step), stage.beta)
-    plot.plot_design(
-        out / "design.png", problem, best.x, f"Optimised design, L = {summary['optimised']:.3f}"
-    )
+    title = f"Optimised design, L = {summary['optimised']:.3f}"
+    plot.plot_design(out / "design.png", result.problem(), result.result.x, title)
     plot.plot_history(out / "history.png", result)
 
 

@@ -2,8 +2,8 @@
 
 A step advances the particle states from t_n to t_n + dt (primes mark the new state, c = 4/dx^2)::
 
-    stress       F'  = (I + dt C) F,   J' = det F'
-                 tau = mu (F'F'^T - I) + lambda ln J' I + s F' S F'^T
+    deform       F'  = (I + dt C) F,   J' = det F'
+    stress       tau = mu (F'F'^T - I) + lambda ln J' I + s F' S F'^T
                  A   = m C - dt V c tau
     p2g          m_i = sum_p w_ip m,   q_i = sum_p w_ip (m v + A (x_i - x))
     grid_update  u_i = wall(q_i / m_i + dt g)
@@ -19,19 +19,24 @@ Grid arrays hold the window of nodes that the particles touch and no others: nod
 
 The kernels also compile for complex128, which makes the complex step an oracle for the adjoint:
 cells, walls and comparisons look at real parts only. They know arrays and numbers, no user objects,
-and they live in one file because Numba's disk cache does not see changes in another one.
+and they live in one file because Numba's disk cache does not see changes in another one. `load`,
+`store`, `pack` and `add_scaled` handle a node's record as one; they stand at the end of the file.
 
 Sources: Hu et al. 2018 (MLS-MPM), Jiang et al. 2015 (APIC), Sato et al. 2023 (actuation).
 """
 
+import operator
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
-from numpy.typing import NDArray
+from llvmlite import ir
+from numba import njit, types
+from numba.core import cgutils
+from numba.extending import intrinsic, models, overload, register_model
+from numpy.typing import DTypeLike, NDArray
 
 STATE_SIZE = 12
-NODE_SIZE = 4  # momentum x, momentum y, mass, padding to a full vector register
+NODE_SIZE = 4  # one vector register: momentum and mass (q_x, q_y, m, 0), velocity (u, v, u, v)
 
 # How `advance` ended.
 DONE, WINDOW_TOO_SMALL, ESCAPED, INVERTED = 0, 1, 2, 3
@@ -76,14 +81,19 @@ class BodyBar(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """Arrays that live for one step. M is the number of node records of the window."""
+    """Arrays that live for one step, for N particles and a window of M nodes."""
 
     affine: NDArray  # (4, N) A, the affine momentum
-    log_J: NDArray  # (N,)
-    velocity: NDArray  # (M, 2) u
+    velocity: NDArray  # (M, 4) u
     affine_bar: NDArray  # (4, N)
-    velocity_bar: NDArray  # (M, 2)
+    velocity_bar: NDArray  # (M, 4)
     node_bar: NDArray  # (M, 4) adjoints of momentum and mass
+
+    @classmethod
+    def make(cls, particles: int, nodes: int, dtype: DTypeLike = float) -> "Scratch":
+        """Room for so many particles and nodes."""
+        affine, node = (4, particles), (nodes, NODE_SIZE)
+        return cls(*(np.zeros(shape, dtype) for shape in (affine, node, affine, node, node)))
 
 
 @jit
@@ -142,8 +152,8 @@ def find_window(state, world):
 
 
 @jit
-def stress(old, new, body, world, signal, scratch):
-    """F' into the new state, A and ln J' into the scratch; the first inverted particle or -1."""
+def deform(old, new, world, log_J):
+    """F' into the new state and ln J'; returns the first inverted particle or -1."""
     dt = world.dt
     C, F, G = old[4:8], old[8:12], new[8:12]
     inverted = -1
@@ -156,9 +166,38 @@ def stress(old, new, body, world, signal, scratch):
         J = f00 * f11 - f01 * f10
         if not J.real > 0.0 and inverted < 0:
             inverted = p
-        log_J = np.log(J)
+        G[0, p], G[1, p], G[2, p], G[3, p] = f00, f01, f10, f11
+        log_J[p] = np.log(J)
+    return inverted
+
+
+@jit
+def deform_adjoint(old, world, bar):
+    """From F_bar' to F_bar, in place; adds to C_bar."""
+    dt = world.dt
+    C, F, C_bar, F_bar = old[4:8], old[8:12], bar[4:8], bar[8:12]
+    for p in range(old.shape[1]):
+        c00, c01, c10, c11 = C[0, p], C[1, p], C[2, p], C[3, p]
+        f00, f01, f10, f11 = F[0, p], F[1, p], F[2, p], F[3, p]
+        b00, b01, b10, b11 = F_bar[0, p], F_bar[1, p], F_bar[2, p], F_bar[3, p]
+        C_bar[0, p] += dt * (b00 * f00 + b01 * f01)
+        C_bar[1, p] += dt * (b00 * f10 + b01 * f11)
+        C_bar[2, p] += dt * (b10 * f00 + b11 * f01)
+        C_bar[3, p] += dt * (b10 * f10 + b11 * f11)
+        F_bar[0, p] = b00 + dt * (c00 * b00 + c10 * b10)
+        F_bar[1, p] = b01 + dt * (c00 * b01 + c10 * b11)
+        F_bar[2, p] = b10 + dt * (c01 * b00 + c11 * b10)
+        F_bar[3, p] = b11 + dt * (c01 * b01 + c11 * b11)
+
+
+@jit
+def stress(old, new, log_J, body, world, signal, scratch):
+    """Affine momentum A from C, F' and ln J'."""
+    C, F = old[4:8], new[8:12]
+    for p in range(old.shape[1]):
+        f00, f01, f10, f11 = F[0, p], F[1, p], F[2, p], F[3, p]
         mu = body.lame_mu[p]
-        spherical = body.lame_lambda[p] * log_J - mu
+        spherical = body.lame_lambda[p] * log_J[p] - mu
         t00 = mu * (f00 * f00 + f01 * f01) + spherical
         t01 = mu * (f00 * f10 + f01 * f11)
         t11 = mu * (f10 * f10 + f11 * f11) + spherical
@@ -172,35 +211,28 @@ def stress(old, new, body, world, signal, scratch):
             t01 += f00 * (s00 * f10 + s01 * f11) + f01 * (s01 * f10 + s11 * f11)
             t11 += f10 * (s00 * f10 + s01 * f11) + f11 * (s01 * f10 + s11 * f11)
         m = body.mass[p]
-        impulse = dt * body.volume[p] * 4.0 / world.dx**2
-        G[0, p], G[1, p], G[2, p], G[3, p] = f00, f01, f10, f11
-        scratch.affine[0, p] = m * c00 - impulse * t00
-        scratch.affine[1, p] = m * c01 - impulse * t01
-        scratch.affine[2, p] = m * c10 - impulse * t01
-        scratch.affine[3, p] = m * c11 - impulse * t11
-        scratch.log_J[p] = log_J
-    return inverted
+        impulse = world.dt * body.volume[p] * 4.0 / world.dx**2
+        scratch.affine[0, p] = m * C[0, p] - impulse * t00
+        scratch.affine[1, p] = m * C[1, p] - impulse * t01
+        scratch.affine[2, p] = m * C[2, p] - impulse * t01
+        scratch.affine[3, p] = m * C[3, p] - impulse * t11
 
 
 @jit
-def stress_adjoint(old, new, body, world, signal, scratch, bar, body_bar, signal_bar):
-    """From A_bar and F_bar' to C_bar and F_bar; adds to the adjoints of the material and signal."""
-    dt = world.dt
-    C, F, G = old[4:8], old[8:12], new[8:12]
+def stress_adjoint(old, new, log_J, body, world, signal, scratch, bar, body_bar, signal_bar):
+    """From A_bar to C_bar; adds to F_bar' and to the adjoints of the material and the signal."""
+    C, F, A_bar = old[4:8], new[8:12], scratch.affine_bar
     C_bar, F_bar = bar[4:8], bar[8:12]
     for p in range(old.shape[1]):
-        c00, c01, c10, c11 = C[0, p], C[1, p], C[2, p], C[3, p]
-        f00, f01, f10, f11 = G[0, p], G[1, p], G[2, p], G[3, p]
-        a00, a01 = scratch.affine_bar[0, p], scratch.affine_bar[1, p]
-        a10, a11 = scratch.affine_bar[2, p], scratch.affine_bar[3, p]
+        f00, f01, f10, f11 = F[0, p], F[1, p], F[2, p], F[3, p]
+        a00, a01, a10, a11 = A_bar[0, p], A_bar[1, p], A_bar[2, p], A_bar[3, p]
         m = body.mass[p]
-        body_bar.mass[p] += a00 * c00 + a01 * c01 + a10 * c10 + a11 * c11
+        C_bar[0, p], C_bar[1, p], C_bar[2, p], C_bar[3, p] = m * a00, m * a01, m * a10, m * a11
+        body_bar.mass[p] += a00 * C[0, p] + a01 * C[1, p] + a10 * C[2, p] + a11 * C[3, p]
 
-        # tau is symmetric: t01 gathers both of its places in A.
-        impulse = -dt * body.volume[p] * 4.0 / world.dx**2
-        t00 = impulse * a00
-        t01 = impulse * (a01 + a10)
-        t11 = impulse * a11
+        # T = tau_bar; tau is symmetric, and t01 gathers both of its places in A.
+        impulse = -world.dt * body.volume[p] * 4.0 / world.dx**2
+        t00, t01, t11 = impulse * a00, impulse * (a01 + a10), impulse * a11
         mu = body.lame_mu[p]
         trace = t00 + t11
         body_bar.lame_mu[p] += (
@@ -209,15 +241,15 @@ def stress_adjoint(old, new, body, world, signal, scratch, bar, body_bar, signal
             + t11 * (f10 * f10 + f11 * f11)
             - trace
         )
-        body_bar.lame_lambda[p] += trace * scratch.log_J[p]
+        body_bar.lame_lambda[p] += trace * log_J[p]
 
-        # F_bar' += mu (T + T^T) F' + lambda tr T F'^-T, with T = tau_bar
+        # F_bar' += mu (T + T^T) F' + lambda tr T F'^-T
         p00, p01, p11 = 2.0 * mu * t00, mu * t01, 2.0 * mu * t11
         pressure = body.lame_lambda[p] * trace / (f00 * f11 - f01 * f10)
-        b00 = F_bar[0, p] + p00 * f00 + p01 * f10 + pressure * f11
-        b01 = F_bar[1, p] + p00 * f01 + p01 * f11 - pressure * f10
-        b10 = F_bar[2, p] + p01 * f00 + p11 * f10 - pressure * f01
-        b11 = F_bar[3, p] + p01 * f01 + p11 * f11 + pressure * f00
+        b00 = p00 * f00 + p01 * f10 + pressure * f11
+        b01 = p00 * f01 + p01 * f11 - pressure * f10
+        b10 = p01 * f00 + p11 * f10 - pressure * f01
+        b11 = p01 * f01 + p11 * f11 + pressure * f00
         k = body.actuator[p]
         if k >= 0:
             s00 = body.actuation_stress[k, 0]
@@ -235,17 +267,10 @@ def stress_adjoint(old, new, body, world, signal, scratch, bar, body_bar, signal
             b01 += s * (2.0 * t00 * g01 + t01 * g11)
             b10 += s * (t01 * g00 + 2.0 * t11 * g10)
             b11 += s * (t01 * g01 + 2.0 * t11 * g11)
-
-        # A = m C - ..., F' = (I + dt C) F
-        h00, h01, h10, h11 = F[0, p], F[1, p], F[2, p], F[3, p]
-        C_bar[0, p] = m * a00 + dt * (b00 * h00 + b01 * h01)
-        C_bar[1, p] = m * a01 + dt * (b00 * h10 + b01 * h11)
-        C_bar[2, p] = m * a10 + dt * (b10 * h00 + b11 * h01)
-        C_bar[3, p] = m * a11 + dt * (b10 * h10 + b11 * h11)
-        F_bar[0, p] = b00 + dt * (c00 * b00 + c10 * b10)
-        F_bar[1, p] = b01 + dt * (c00 * b01 + c10 * b11)
-        F_bar[2, p] = b10 + dt * (c01 * b00 + c11 * b10)
-        F_bar[3, p] = b11 + dt * (c01 * b01 + c11 * b11)
+        F_bar[0, p] += b00
+        F_bar[1, p] += b01
+        F_bar[2, p] += b10
+        F_bar[3, p] += b11
 
 
 @jit
@@ -260,15 +285,14 @@ def p2g(state, body, world, scratch, window, grid):
         m = body.mass[p]
         qx, qy = m * v[0, p], m * v[1, p]
         a00, a01, a10, a11 = A[0, p], A[1, p], A[2, p], A[3, p]
+        down = pack(grid, a01, a11, 0.0, 0.0)
         for a in range(3):
             node = (i - i0 + a) * nj + j - j0
-            row_x = qx + a00 * rx[a]
-            row_y = qy + a10 * rx[a]
+            row = pack(grid, qx + a00 * rx[a], qy + a10 * rx[a], m, 0.0)
             for b in range(3):
                 w = wx[a] * wy[b]
-                grid[node + b, 0] += w * (row_x + a01 * ry[b])
-                grid[node + b, 1] += w * (row_y + a11 * ry[b])
-                grid[node + b, 2] += w * m
+                momentum = add_scaled(ry[b], down, row)
+                store(grid, node + b, add_scaled(w, momentum, load(grid, node + b)))
 
 
 @jit
@@ -286,37 +310,44 @@ def p2g_adjoint(state, body, world, scratch, window, bar, body_bar):
         m = body.mass[p]
         qx, qy = m * v[0, p], m * v[1, p]
         a00, a01, a10, a11 = A[0, p], A[1, p], A[2, p], A[3, p]
-        gx = gy = sum_x = sum_y = sum_m = 0.0
-        b00 = b01 = b10 = b11 = 0.0
+        # Sums over the nodes, named by their weights along x and y: the weight w, its slope s, each
+        # perhaps times the distance r. Lanes: adjoints of q_x, q_y and m.
+        ww = wr_w = w_wr = s_w = sr_w = s_wr = w_s = wr_s = w_sr = zero(grid_bar)
         for a in range(3):
             node = (i - i0 + a) * nj + j - j0
-            row_x = qx + a00 * rx[a]
-            row_y = qy + a10 * rx[a]
-            across = along = row_qx = row_qy = 0.0
+            row_w = row_wr = row_s = row_sr = zero(grid_bar)
             for b in range(3):
-                qx_bar, qy_bar = grid_bar[node + b, 0], grid_bar[node + b, 1]
-                m_bar = grid_bar[node + b, 2]
-                w_bar = qx_bar * (row_x + a01 * ry[b]) + qy_bar * (row_y + a11 * ry[b]) + m_bar * m
-                across += wy[b] * w_bar
-                along += slope_y[b] * w_bar
-                row_qx += wy[b] * qx_bar
-                row_qy += wy[b] * qy_bar
-                w = wx[a] * wy[b]
-                b01 += w * ry[b] * qx_bar
-                b11 += w * ry[b] * qy_bar
-                sum_m += w * m_bar
-            gx += slope_x[a] * across
-            gy += wx[a] * along
-            sum_x += wx[a] * row_qx
-            sum_y += wx[a] * row_qy
-            b00 += wx[a] * rx[a] * row_qx
-            b10 += wx[a] * rx[a] * row_qy
-        x_bar[0, p] += gx - (a00 * sum_x + a10 * sum_y)
-        x_bar[1, p] += gy - (a01 * sum_x + a11 * sum_y)
-        v_bar[0, p] = m * sum_x
-        v_bar[1, p] = m * sum_y
-        A_bar[0, p], A_bar[1, p], A_bar[2, p], A_bar[3, p] = b00, b01, b10, b11
-        body_bar.mass[p] += sum_m + v[0, p] * sum_x + v[1, p] * sum_y
+                record = load(grid_bar, node + b)
+                row_w = add_scaled(wy[b], record, row_w)
+                row_wr = add_scaled(wy[b] * ry[b], record, row_wr)
+                row_s = add_scaled(slope_y[b], record, row_s)
+                row_sr = add_scaled(slope_y[b] * ry[b], record, row_sr)
+            w, r, s = wx[a], rx[a], slope_x[a]
+            ww = add_scaled(w, row_w, ww)
+            wr_w = add_scaled(w * r, row_w, wr_w)
+            w_wr = add_scaled(w, row_wr, w_wr)
+            s_w = add_scaled(s, row_w, s_w)
+            sr_w = add_scaled(s * r, row_w, sr_w)
+            s_wr = add_scaled(s, row_wr, s_wr)
+            w_s = add_scaled(w, row_s, w_s)
+            wr_s = add_scaled(w * r, row_s, wr_s)
+            w_sr = add_scaled(w, row_sr, w_sr)
+        x_bar[0, p] += (
+            (qx * s_w[0] + a00 * sr_w[0] + a01 * s_wr[0])
+            + (qy * s_w[1] + a10 * sr_w[1] + a11 * s_wr[1])
+            + m * s_w[2]
+            - (a00 * ww[0] + a10 * ww[1])
+        )
+        x_bar[1, p] += (
+            (qx * w_s[0] + a00 * wr_s[0] + a01 * w_sr[0])
+            + (qy * w_s[1] + a10 * wr_s[1] + a11 * w_sr[1])
+            + m * w_s[2]
+            - (a01 * ww[0] + a11 * ww[1])
+        )
+        v_bar[0, p] = m * ww[0]
+        v_bar[1, p] = m * ww[1]
+        A_bar[0, p], A_bar[1, p], A_bar[2, p], A_bar[3, p] = wr_w[0], w_wr[0], wr_w[1], w_wr[1]
+        body_bar.mass[p] += ww[2] + v[0, p] * ww[0] + v[1, p] * ww[1]
 
 
 @jit
@@ -382,11 +413,9 @@ def grid_update(grid, window, world, scratch):
                 u = grid[node, 0] / m + world.dt * world.gravity_x
                 v = grid[node, 1] / m + world.dt * world.gravity_y
                 u, v = wall(i0 + a, j0 + b, u, v, world)
-                scratch.velocity[node, 0] = u
-                scratch.velocity[node, 1] = v
+                store(scratch.velocity, node, pack(scratch.velocity, u, v, u, v))
             else:
-                scratch.velocity[node, 0] = 0.0
-                scratch.velocity[node, 1] = 0.0
+                store(scratch.velocity, node, zero(scratch.velocity))
 
 
 @jit
@@ -424,23 +453,20 @@ def g2p(old, new, world, scratch, window):
     for p in range(old.shape[1]):
         i, wx, rx = weights(old[0, p], world.dx)
         j, wy, ry = weights(old[1, p], world.dx)
-        u = v = c00 = c01 = c10 = c11 = 0.0
+        # Lanes: sums over u and v, then over u r_y and v r_y.
+        across_0 = pack(velocity, wy[0], wy[0], wy[0] * ry[0], wy[0] * ry[0])
+        across_1 = pack(velocity, wy[1], wy[1], wy[1] * ry[1], wy[1] * ry[1])
+        across_2 = pack(velocity, wy[2], wy[2], wy[2] * ry[2], wy[2] * ry[2])
+        mean = along = zero(velocity)
         for a in range(3):
             node = (i - i0 + a) * nj + j - j0
-            row_u = row_v = row_uy = row_vy = 0.0
-            for b in range(3):
-                wu = wy[b] * velocity[node + b, 0]
-                wv = wy[b] * velocity[node + b, 1]
-                row_u += wu
-                row_v += wv
-                row_uy += wu * ry[b]
-                row_vy += wv * ry[b]
-            u += wx[a] * row_u
-            v += wx[a] * row_v
-            c00 += wx[a] * rx[a] * row_u
-            c10 += wx[a] * rx[a] * row_v
-            c01 += wx[a] * row_uy
-            c11 += wx[a] * row_vy
+            row = add_scaled(across_0, load(velocity, node), zero(velocity))
+            row = add_scaled(across_1, load(velocity, node + 1), row)
+            row = add_scaled(across_2, load(velocity, node + 2), row)
+            mean = add_scaled(wx[a], row, mean)
+            along = add_scaled(wx[a] * rx[a], row, along)
+        u, v = mean[0], mean[1]
+        c00, c01, c10, c11 = along[0], mean[2], along[1], mean[3]
         new[0, p] = old[0, p] + world.dt * u
         new[1, p] = old[1, p] + world.dt * v
         new[2, p], new[3, p] = u, v
@@ -463,40 +489,52 @@ def g2p_adjoint(old, new, world, scratch, window, bar):
         u_bar = bar[2, p] + world.dt * bar[0, p]
         v_bar = bar[3, p] + world.dt * bar[1, p]
         c00, c01, c10, c11 = c * bar[4, p], c * bar[5, p], c * bar[6, p], c * bar[7, p]
-        gx = gy = 0.0
+        # Sums over the nodes, named as in `p2g_adjoint`. Lanes: over u and v, then u r_y and v r_y.
+        s_w = sr_w = w_s = wr_s = zero(velocity)
+        down = pack(velocity, c01, c11, 0.0, 0.0)
         for a in range(3):
             node = (i - i0 + a) * nj + j - j0
-            row_x = u_bar + c00 * rx[a]
-            row_y = v_bar + c10 * rx[a]
-            across = along = 0.0
+            row = pack(velocity, u_bar + c00 * rx[a], v_bar + c10 * rx[a], 0.0, 0.0)
+            row_w = row_s = zero(velocity)
             for b in range(3):
-                hx = row_x + c01 * ry[b]
-                hy = row_y + c11 * ry[b]
-                w = wx[a] * wy[b]
-                w_bar = velocity[node + b, 0] * hx + velocity[node + b, 1] * hy
-                across += wy[b] * w_bar
-                along += slope_y[b] * w_bar
-                velocity_bar[node + b, 0] += w * hx
-                velocity_bar[node + b, 1] += w * hy
-            gx += slope_x[a] * across
-            gy += wx[a] * along
-        bar[0, p] += gx - (c00 * u + c10 * v)
-        bar[1, p] += gy - (c01 * u + c11 * v)
+                w, wr, s, sr = wy[b], wy[b] * ry[b], slope_y[b], slope_y[b] * ry[b]
+                record = load(velocity, node + b)
+                row_w = add_scaled(pack(velocity, w, w, wr, wr), record, row_w)
+                row_s = add_scaled(pack(velocity, s, s, sr, sr), record, row_s)
+                h = add_scaled(ry[b], down, row)
+                h = add_scaled(wx[a] * w, h, load(velocity_bar, node + b))
+                store(velocity_bar, node + b, h)
+            s_w = add_scaled(slope_x[a], row_w, s_w)
+            sr_w = add_scaled(slope_x[a] * rx[a], row_w, sr_w)
+            w_s = add_scaled(wx[a], row_s, w_s)
+            wr_s = add_scaled(wx[a] * rx[a], row_s, wr_s)
+        bar[0, p] += (
+            (u_bar * s_w[0] + c00 * sr_w[0] + c01 * s_w[2])
+            + (v_bar * s_w[1] + c10 * sr_w[1] + c11 * s_w[3])
+            - (c00 * u + c10 * v)
+        )
+        bar[1, p] += (
+            (u_bar * w_s[0] + c00 * wr_s[0] + c01 * w_s[2])
+            + (v_bar * w_s[1] + c10 * wr_s[1] + c11 * w_s[3])
+            - (c01 * u + c11 * v)
+        )
 
 
 @jit
-def advance(states, grids, windows, first, last, body, world, signal, scratch):
+def advance(states, grids, windows, logs, first, last, body, world, signal, scratch):
     """Advance from the start of step `first` to the start of step `last`.
 
     Step n leads from slot n to slot n + 1 of `states` and leaves its nodes in slot n of `grids` and
-    `windows`; slots are counted round, so that two states and one grid suffice where nothing is
-    kept. Returns the step reached, how it ended, and the particle concerned (or -1); when the
-    window does not fit into the records, more records and another call from the step reached go on.
+    `windows` and its ln J' in slot n of `logs`; slots are counted round, so that two states and one
+    of the others suffice where nothing is kept. Returns the step reached, how it ended, and the
+    particle concerned (or -1); when the window does not fit into the records, more records and
+    another call from the step reached go on.
     """
     for n in range(first, last):
         old = states[n % states.shape[0]]
         new = states[(n + 1) % states.shape[0]]
-        grid = grids[n % grids.shape[0]]
+        slot = n % grids.shape[0]
+        grid, log_J = grids[slot], logs[slot]
         i0, j0, ni, nj, particle = find_window(old, world)
         if particle >= 0:
             return n, ESCAPED, particle
@@ -504,10 +542,11 @@ def advance(states, grids, windows, first, last, body, world, signal, scratch):
             return n, WINDOW_TOO_SMALL, -1
         window = (i0, j0, ni, nj)
         for k in range(4):
-            windows[n % grids.shape[0], k] = window[k]
-        particle = stress(old, new, body, world, signal[n], scratch)
+            windows[slot, k] = window[k]
+        particle = deform(old, new, world, log_J)
         if particle >= 0:
             return n, INVERTED, particle
+        stress(old, new, log_J, body, world, signal[n], scratch)
         p2g(old, body, world, scratch, window, grid)
         grid_update(grid, window, world, scratch)
         g2p(old, new, world, scratch, window)
@@ -515,19 +554,185 @@ def advance(states, grids, windows, first, last, body, world, signal, scratch):
 
 
 @jit
-def advance_adjoint(states, grids, windows, first, last, body, world, signal, scratch, bar,
+def advance_adjoint(states, grids, windows, logs, first, last, body, world, signal, scratch, bar,
                     body_bar, signal_bar):  # fmt: skip
     """Go back from the start of step `last` to the start of step `first`: the adjoint of `advance`.
 
     `bar` (12, N) holds the adjoint of the state and is overwritten; `body_bar` and `signal_bar`
-    (steps, K) are added to. All states and grids of the steps must have been kept.
+    (steps, K) are added to. All that `advance` leaves of the steps must have been kept.
     """
     for n in range(last - 1, first - 1, -1):
-        old, new, grid = states[n], states[n + 1], grids[n]
+        old, new, grid, log_J = states[n], states[n + 1], grids[n], logs[n]
         window = (windows[n, 0], windows[n, 1], windows[n, 2], windows[n, 3])
-        stress(old, new, body, world, signal[n], scratch)
+        stress(old, new, log_J, body, world, signal[n], scratch)
         grid_update(grid, window, world, scratch)
         g2p_adjoint(old, new, world, scratch, window, bar)
         grid_update_adjoint(grid, window, world, scratch)
         p2g_adjoint(old, body, world, scratch, window, bar, body_bar)
-        stress_adjoint(old, new, body, world, signal[n], scratch, bar, body_bar, signal_bar[n])
+        stress_adjoint(
+            old, new, log_J, body, world, signal[n], scratch, bar, body_bar, signal_bar[n]
+        )
+        deform_adjoint(old, world, bar)
+
+
+# Records of four numbers. These functions on tuples are their definition; in double precision the
+# compiler is given vector registers instead, which it does not find by itself.
+
+
+def load(array, k):
+    """Record k of an array (M, 4)."""
+    return array[k, 0], array[k, 1], array[k, 2], array[k, 3]
+
+
+def store(array, k, record):
+    """Write record k of an array (M, 4)."""
+    array[k, 0], array[k, 1], array[k, 2], array[k, 3] = record
+
+
+def zero(array):
+    """The record of zeros of an array's type."""
+    z = array.dtype.type(0.0)
+    return z, z, z, z
+
+
+def pack(array, a, b, c, d):
+    """The record of four numbers, of an array's type."""
+    return a, b, c, d
+
+
+def add_scaled(s, x, y):
+    """The record s x + y; s is a number or a record."""
+    if not isinstance(s, tuple):
+        s = (s, s, s, s)
+    return s[0] * x[0] + y[0], s[1] * x[1] + y[1], s[2] * x[2] + y[2], s[3] * x[3] + y[3]
+
+
+class Register(types.Type):
+    """A record in a vector register."""
+
+    def __init__(self):
+        super().__init__("Register")
+
+
+register = Register()
+VECTOR = ir.VectorType(ir.DoubleType(), NODE_SIZE)
+FLAGS = ("contract", "reassoc", "nsz", "arcp")
+
+
+@register_model(Register)
+class RegisterModel(models.PrimitiveModel):
+    """As a vector of LLVM."""
+
+    def __init__(self, manager, kind):
+        super().__init__(manager, kind, VECTOR)
+
+
+def _record_pointer(context, builder, signature, arguments):
+    array_type = signature.args[0]
+    array = context.make_array(array_type)(context, builder, arguments[0])
+    first = context.get_constant(types.intp, 0)
+    pointer = cgutils.get_item_pointer(
+        context, builder, array_type, array, [arguments[1], first], wraparound=False
+    )
+    return builder.bitcast(pointer, VECTOR.as_pointer())
+
+
+def _broadcast(builder, values):
+    vector = ir.Constant(VECTOR, ir.Undefined)
+    for lane, value in enumerate(values):
+        vector = builder.insert_element(vector, value, ir.Constant(ir.IntType(32), lane))
+    return vector
+
+
+@intrinsic
+def _load(typingctx, array, k):
+    def generate(context, builder, signature, arguments):
+        return builder.load(_record_pointer(context, builder, signature, arguments), align=8)
+
+    return register(array, types.intp), generate
+
+
+@intrinsic
+def _store(typingctx, array, k, record):
+    def generate(context, builder, signature, arguments):
+        pointer = _record_pointer(context, builder, signature, arguments)
+        builder.store(arguments[2], pointer, align=8)
+        return context.get_dummy_value()
+
+    return types.none(array, types.intp, record), generate
+
+
+@intrinsic
+def _pack(typingctx, a, b, c, d):
+    def generate(context, builder, signature, arguments):
+        return _broadcast(builder, arguments)
+
+    return register(*4 * (types.float64,)), generate
+
+
+@intrinsic
+def _add_scaled(typingctx, s, x, y):
+    def generate(context, builder, signature, arguments):
+        factor, x, y = arguments
+        if signature.args[0] == types.float64:
+            factor = _broadcast(builder, NODE_SIZE * [factor])
+        return builder.fadd(builder.fmul(factor, x, flags=FLAGS), y, flags=FLAGS)
+
+    return register(s, x, y), generate
+
+
+@intrinsic
+def _lane(typingctx, record, k):
+    def generate(context, builder, signature, arguments):
+        lane = builder.trunc(arguments[1], ir.IntType(32))
+        return builder.extract_element(arguments[0], lane)
+
+    return types.float64(record, types.intp), generate
+
+
+@overload(operator.getitem)
+def _getitem(record, k):
+    if isinstance(record, Register):
+        return lambda record, k: _lane(record, k)
+
+
+@overload(load)
+def _overload_load(array, k):
+    if array.dtype == types.float64:
+        return lambda array, k: _load(array, k)
+    return load
+
+
+@overload(store)
+def _overload_store(array, k, record):
+    if array.dtype == types.float64:
+        return lambda array, k, record: _store(array, k, record)
+    return store
+
+
+@overload(zero)
+def _overload_zero(array):
+    if array.dtype == types.float64:
+        return lambda array: _pack(0.0, 0.0, 0.0, 0.0)
+    return lambda array: (0j, 0j, 0j, 0j)
+
+
+@overload(pack)
+def _overload_pack(array, a, b, c, d):
+    if array.dtype == types.float64:
+        return lambda array, a, b, c, d: _pack(a, b, c, d)
+    return lambda array, a, b, c, d: (a + 0j, b + 0j, c + 0j, d + 0j)
+
+
+@overload(add_scaled)
+def _overload_add_scaled(s, x, y):
+    if isinstance(x, Register):
+        return lambda s, x, y: _add_scaled(s, x, y)
+    if isinstance(s, types.BaseTuple):
+        return lambda s, x, y: (
+            s[0] * x[0] + y[0],
+            s[1] * x[1] + y[1],
+            s[2] * x[2] + y[2],
+            s[3] * x[3] + y[3],
+        )
+    return lambda s, x, y: (s * x[0] + y[0], s * x[1] + y[1], s * x[2] + y[2], s * x[3] + y[3])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -196,6 +197,12 @@ class Optimisation:
                 "every evaluation failed", 0, -1, (np.nan, np.nan), "see the history's failures"
             )
         return self.best[max(self.best)]
+
+    def problem(self) -> Problem:
+        """The problem that `result` solves, in the time step that it was evaluated with."""
+        best = self.result
+        stage = dataclasses.replace(self.settings.stages[best.stage], time_step=best.time_step)
+        return Problem(stage.scene(self.scene), stage.beta)
 
     @property
     def failed_evaluations(self) -> int:

@@ -47,6 +47,8 @@ class RunFile:
         Columns named as the fields of `Iteration`.
     designs : dict of int to (n,) array
         The best design of each stage that had one.
+    time_steps : dict of int to float
+        In which these were evaluated.
     stop_reason : str
         Empty if the run was not finished.
     """
@@ -56,6 +58,7 @@ class RunFile:
     versions: dict[str, str]
     history: dict[str, NDArray]
     designs: dict[int, NDArray[np.float64]]
+    time_steps: dict[int, float]
     stop_reason: str
 
     @property
@@ -78,7 +81,8 @@ class RunFile:
 
     def problem(self, stage: int | None = None) -> Problem:
         """The problem that a stage solved, by default that of the best design."""
-        chosen = self.settings.stages[self.best_stage if stage is None else stage]
+        index = self.best_stage if stage is None else stage
+        chosen = dataclasses.replace(self.settings.stages[index], time_step=self.time_steps[index])
         return Problem(chosen.scene(self.scene), chosen.beta)
 
 
@@ -195,6 +199,7 @@ def read(path: Path) -> RunFile:
                 versions=json.loads(file.attrs["versions"]),
                 history=history,
                 designs={stage: _numbers(file, f"stages/{stage}/x") for stage in stages},
+                time_steps={k: float(file[f"stages/{k}"].attrs["time_step"]) for k in stages},
                 stop_reason=str(file.attrs["stop_reason"]),
             )
     except MpmoptError as error:

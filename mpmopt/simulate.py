@@ -185,7 +185,8 @@ class Simulation:
         """
         state, dtype = self.initial.shape, self.initial.dtype
         nodes = _capacity(self)
-        step_bytes = (self.initial.size + mpm.NODE_SIZE * nodes) * dtype.itemsize
+        numbers = self.initial.size + state[1] + mpm.NODE_SIZE * nodes  # state, ln J, nodes
+        step_bytes = numbers * dtype.itemsize
         schedule = Schedule.choose(self.steps, step_bytes, wish)
         length = schedule.segment
         arrays: dict[str, tuple[tuple[int, ...], DTypeLike]] = {"state": (state, dtype)}
@@ -194,6 +195,7 @@ class Simulation:
                 "states": ((length + 1, *state), dtype),
                 "grids": ((length, nodes, mpm.NODE_SIZE), dtype),
                 "windows": ((length, 4), np.int64),
+                "logs": ((length, state[1]), dtype),
             }
         return Checkpoints(schedule, arrays, wish.store)
 
@@ -220,31 +222,24 @@ class Simulation:
 
 
 class _Segment:
-    """Working memory of a segment: the states and nodes of its steps, and scratch arrays."""
+    """Working memory of a segment: what `mpm.advance` leaves of its steps, and scratch arrays."""
 
     def __init__(self, simulation: Simulation, length: int) -> None:
         self.simulation = simulation
         count, dtype = simulation.initial.shape[1], simulation.initial.dtype
         self.states = np.empty((length + 1, mpm.STATE_SIZE, count), dtype)
         self.windows = np.zeros((length, 4), np.int64)
+        self.logs = np.empty((length, count), dtype)
         self.grids = np.empty((length, 0, mpm.NODE_SIZE), dtype)
         self.recomputed: set[int] = set()  # segments whose windows outgrew their room in the store
-        self._affine, self._log_J = np.empty((4, count), dtype), np.empty(count, dtype)
         self.resize(_capacity(simulation))
 
     def resize(self, nodes: int) -> None:
         """Make room for windows of so many nodes, keeping the grids."""
-        kept, dtype = self.grids, self.grids.dtype
-        self.grids = np.empty((len(kept), nodes, mpm.NODE_SIZE), dtype)
+        kept, count = self.grids, self.states.shape[2]
+        self.grids = np.empty((len(kept), nodes, mpm.NODE_SIZE), kept.dtype)
         self.grids[:, : kept.shape[1]] = kept
-        self.scratch = mpm.Scratch(
-            affine=self._affine,
-            log_J=self._log_J,
-            velocity=np.empty((nodes, 2), dtype),
-            affine_bar=np.empty_like(self._affine),
-            velocity_bar=np.empty((nodes, 2), dtype),
-            node_bar=np.empty((nodes, mpm.NODE_SIZE), dtype),
-        )
+        self.scratch = mpm.Scratch.make(count, nodes, kept.dtype)
 
     def advance(self, first: int, last: int) -> None:
         """Advance from step `first`, whose state is in slot 0, to step `last`."""
@@ -256,6 +251,7 @@ class _Segment:
                 self.states,
                 self.grids,
                 self.windows,
+                self.logs,
                 reached,
                 min(steps, reached + STEPS_PER_CALL),
                 simulation.body,
@@ -277,7 +273,9 @@ class _Segment:
             checkpoints.write(index, states=self.states)
         else:
             grids = self.grids[:, :used]
-            checkpoints.write(index, states=self.states, grids=grids, windows=self.windows)
+            checkpoints.write(
+                index, states=self.states, grids=grids, windows=self.windows, logs=self.logs
+            )
 
     def recall(self, index: int, first: int, last: int, checkpoints: Checkpoints) -> None:
         """Bring the states and nodes of a segment back: read them, or recompute them."""
@@ -290,6 +288,7 @@ class _Segment:
             self.advance(first, last)
         else:
             self.windows[:] = checkpoints.read(index, "windows")
+            self.logs[:] = checkpoints.read(index, "logs")
             grids = checkpoints.read(index, "grids")
             self.grids[:, : grids.shape[1]] = grids
 
@@ -339,6 +338,7 @@ class Forward:
                     memory.states,
                     memory.grids,
                     memory.windows,
+                    memory.logs,
                     max(0, stop - STEPS_PER_CALL),
                     stop,
                     simulation.body,

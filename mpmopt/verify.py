@@ -88,7 +88,12 @@ def kernel_mismatches(scene: Scene, seed: int = 0) -> dict[str, float]:
     rng = np.random.default_rng(seed)
     bench = _Bench(scene, rng)
     tests = {
-        "stress": (bench.stress, bench.stress_adjoint, "old affine_velocity mass la mu signal"),
+        "deform": (bench.deform, bench.deform_adjoint, "affine_velocity deformation"),
+        "stress": (
+            bench.stress,
+            bench.stress_adjoint,
+            "affine_velocity deformation mass la mu signal",
+        ),
         "p2g": (bench.p2g, bench.p2g_adjoint, "position velocity affine mass"),
         "grid_update": (bench.grid_update, bench.grid_update_adjoint, "grid"),
         "g2p": (bench.g2p, bench.g2p_adjoint, "position node_velocity"),
@@ -166,7 +171,7 @@ class _Bench:
             "position": self.state[0:2],
             "velocity": self.state[2:4],
             "affine_velocity": self.state[4:8],
-            "old": self.state[8:12],
+            "deformation": self.state[8:12],
             "mass": self.body.mass,
             "la": self.body.lame_lambda,
             "mu": self.body.lame_mu,
@@ -178,15 +183,7 @@ class _Bench:
         self._ones = ones
 
     def _scratch(self, dtype: type) -> mpm.Scratch:
-        count = self.state.shape[1]
-        return mpm.Scratch(
-            affine=np.zeros((4, count), dtype),
-            log_J=np.zeros(count, dtype),
-            velocity=np.zeros((self.nodes, 2), dtype),
-            affine_bar=np.zeros((4, count), dtype),
-            velocity_bar=np.zeros((self.nodes, 2), dtype),
-            node_bar=np.zeros((self.nodes, mpm.NODE_SIZE), dtype),
-        )
+        return mpm.Scratch.make(self.state.shape[1], self.nodes, dtype)
 
     def _state(self, v: Arrays, dtype: type) -> NDArray:
         state: NDArray = self.state.astype(dtype)
@@ -194,7 +191,7 @@ class _Bench:
             ("position", slice(0, 2)),
             ("velocity", slice(2, 4)),
             ("affine_velocity", slice(4, 8)),
-            ("old", slice(8, 12)),
+            ("deformation", slice(8, 12)),
         ):
             if name in v:
                 state[rows] = v[name]
@@ -210,26 +207,43 @@ class _Bench:
     def _body_bar(self) -> mpm.BodyBar:
         return mpm.BodyBar(*(0.0 * self._ones for _ in mpm.BodyBar._fields))
 
+    def deform(self, v: Arrays) -> Arrays:
+        old = self._state(v, np.result_type(*v.values()).type)
+        new, log_J = old.copy(), np.zeros_like(old[0])
+        mpm.deform(old, new, self.world, log_J)
+        return {"new": new[8:12]}
+
+    def deform_adjoint(self, v: Arrays, w: Arrays) -> Arrays:
+        old = self._state(v, float)
+        bar = np.zeros_like(old)
+        bar[8:12] = w["new"]
+        mpm.deform_adjoint(old, self.world, bar)
+        return {"affine_velocity": bar[4:8], "deformation": bar[8:12]}
+
     def stress(self, v: Arrays) -> Arrays:
+        # Here the deformation gradient is the new one, on which the stress depends.
         dtype = np.result_type(*v.values()).type
-        old, scratch = self._state(v, dtype), self._scratch(dtype)
-        new = old.copy()
-        mpm.stress(old, new, self._body(v, dtype), self.world, v["signal"], scratch)
-        return {"new": new[8:12], "affine": scratch.affine}
+        state, scratch = self._state(v, dtype), self._scratch(dtype)
+        mpm.stress(
+            state,
+            state,
+            _log_jacobian(state),
+            self._body(v, dtype),
+            self.world,
+            v["signal"],
+            scratch,
+        )
+        return {"affine": scratch.affine}
 
     def stress_adjoint(self, v: Arrays, w: Arrays) -> Arrays:
-        old, scratch, body = self._state(v, float), self._scratch(float), self._body(v, float)
-        new, bar, body_bar = old.copy(), np.zeros_like(old), self._body_bar()
-        signal_bar = np.zeros_like(v["signal"])
-        mpm.stress(old, new, body, self.world, v["signal"], scratch)
+        state, scratch, body = self._state(v, float), self._scratch(float), self._body(v, float)
+        bar, body_bar, signal_bar = np.zeros_like(state), self._body_bar(), 0.0 * v["signal"]
         scratch.affine_bar[:] = w["affine"]
-        bar[8:12] = w["new"]
-        mpm.stress_adjoint(
-            old, new, body, self.world, v["signal"], scratch, bar, body_bar, signal_bar
-        )
+        given = (state, state, _log_jacobian(state), body, self.world, v["signal"])
+        mpm.stress_adjoint(*given, scratch, bar, body_bar, signal_bar)
         return {
-            "old": bar[8:12],
             "affine_velocity": bar[4:8],
+            "deformation": bar[8:12],
             "mass": body_bar.mass,
             "la": body_bar.lame_lambda,
             "mu": body_bar.lame_mu,
@@ -267,11 +281,11 @@ class _Bench:
         dtype = np.result_type(*v.values()).type
         scratch = self._scratch(dtype)
         mpm.grid_update(self._grid(v, dtype), self.window, self.world, scratch)
-        return {"velocity": scratch.velocity}
+        return {"velocity": scratch.velocity[:, :2]}
 
     def grid_update_adjoint(self, v: Arrays, w: Arrays) -> Arrays:
         scratch = self._scratch(float)
-        scratch.velocity_bar[:] = w["velocity"]
+        scratch.velocity_bar[:, :2] = w["velocity"]
         mpm.grid_update_adjoint(self._grid(v, float), self.window, self.world, scratch)
         return {"grid": scratch.node_bar[:, :3][self.mass_grid > 0.0]}
 
@@ -279,18 +293,22 @@ class _Bench:
         dtype = np.result_type(*v.values()).type
         old, scratch = self._state(v, dtype), self._scratch(dtype)
         new = np.zeros_like(old)
-        scratch.velocity[:] = v["node_velocity"]
+        scratch.velocity[:] = np.hstack([v["node_velocity"]] * 2)
         mpm.g2p(old, new, self.world, scratch, self.window)
         return {"new": new[0:8]}
 
     def g2p_adjoint(self, v: Arrays, w: Arrays) -> Arrays:
         old, scratch = self._state(v, float), self._scratch(float)
         new, bar = np.zeros_like(old), np.zeros_like(old)
-        scratch.velocity[:] = v["node_velocity"]
+        scratch.velocity[:] = np.hstack([v["node_velocity"]] * 2)
         mpm.g2p(old, new, self.world, scratch, self.window)
         bar[0:8] = w["new"]
         mpm.g2p_adjoint(old, new, self.world, scratch, self.window, bar)
-        return {"position": bar[0:2], "node_velocity": scratch.velocity_bar}
+        return {"position": bar[0:2], "node_velocity": scratch.velocity_bar[:, :2]}
+
+
+def _log_jacobian(state: NDArray) -> NDArray:
+    return np.log(state[8] * state[11] - state[9] * state[10])
 
 
 def complex_step_errors(

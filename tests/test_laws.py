@@ -192,14 +192,12 @@ def manufactured_error(n, amplitude, courant=0.2, per_cell=2):
     side, count = n + 7, X.shape[1]
     window = (0, 0, side, side)
     grid = np.zeros((side * side, mpm.NODE_SIZE))
-    scratch = mpm.Scratch(
-        np.zeros((4, count)), np.zeros(count), np.zeros((side * side, 2)),
-        np.zeros((4, count)), np.zeros((side * side, 2)), grid.copy(),
-    )  # fmt: skip
+    scratch, log_J = mpm.Scratch.make(count, side * side), np.zeros(count)
     worst = 0.0
     for step in range(steps):
         old[2:4] += dt * force(step * dt)
-        mpm.stress(old, new, body, world, np.zeros(0), scratch)
+        mpm.deform(old, new, world, log_J)
+        mpm.stress(old, new, log_J, body, world, np.zeros(0), scratch)
         mpm.p2g(old, body, world, scratch, window, grid)
         mirror(grid.reshape(side, side, 4), 0, n)
         mirror(grid.reshape(side, side, 4).transpose(1, 0, 2), 1, n)

@@ -26,12 +26,19 @@ def one_step(scene, state, signal=0.0, dtype=float):
     states[0] = state
     grids = np.zeros((1, nodes, mpm.NODE_SIZE), dtype)
     windows = np.zeros((1, 4), np.int64)
-    scratch = mpm.Scratch(
-        np.zeros((4, count), dtype), np.zeros(count, dtype), np.zeros((nodes, 2), dtype),
-        np.zeros((4, count), dtype), np.zeros((nodes, 2), dtype), np.zeros((nodes, 4), dtype),
-    )  # fmt: skip
+    logs = np.zeros((1, count), dtype)
+    scratch = mpm.Scratch.make(count, nodes, dtype)
     reached, end, particle = mpm.advance(
-        states, grids, windows, 0, 1, simulation.body, simulation.world, simulation.signal, scratch
+        states,
+        grids,
+        windows,
+        logs,
+        0,
+        1,
+        simulation.body,
+        simulation.world,
+        simulation.signal,
+        scratch,
     )
     assert (reached, end, particle) == (1, mpm.DONE, -1)
     return states[1], grids[0], windows[0], scratch
@@ -213,6 +220,6 @@ def test_complex_kernels_have_the_same_real_part(free, state):
 def test_every_adjoint_is_the_transpose_of_its_kernel(seed):
     mismatches = kernel_mismatches(small_scene(), seed)
     assert set(mismatches) == {
-        "stress", "p2g", "grid_update", "g2p", "design", "signal", "objective"
+        "deform", "stress", "p2g", "grid_update", "g2p", "design", "signal", "objective"
     }  # fmt: skip
     assert max(mismatches.values()) <= DOT_TOLERANCE

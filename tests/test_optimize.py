@@ -109,6 +109,8 @@ def test_a_stage_whose_first_design_fails_halves_its_step(scene, start, monkeypa
     assert [step for step, _ in calls[:3]] == [4e-3, 2e-3, 1e-3]
     assert all(np.array_equal(x, start) for _, x in calls[:3])
     assert run.result.time_step == 1e-3
+    assert run.problem().scene.time_step == 1e-3
+    assert run.problem().value(run.result.x) == run.result.objective
     assert run.failed_evaluations == 2
 
 

@@ -50,6 +50,12 @@ def test_a_run_is_read_back_as_it_was(run, path):
     assert back.problem(0).value(back.designs[0]) == run.best[0].objective
 
 
+def test_a_halved_time_step_is_remembered(run, tmp_path):
+    best = {0: dataclasses.replace(run.best[0], time_step=2e-3)}
+    runfile.write(tmp_path / "run.h5", dataclasses.replace(run, best=best))
+    assert runfile.read(tmp_path / "run.h5").problem().scene.time_step == 2e-3
+
+
 def test_the_best_design_is_there_by_name(run, path):
     with h5py.File(path) as file:
         best = {name: values[()] for name, values in file["best"].items()}
