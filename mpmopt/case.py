@@ -102,6 +102,7 @@ def run(case: Case, out: Path, checkpointing: Checkpointing | None = None) -> di
 def summarise(result: Optimisation, start: np.ndarray) -> dict[str, Any]:
     """Objective values (L, larger is farther), actuation and counts of a finished optimisation."""
     best, problem = result.result, result.problem()
+    half = Problem(problem.scene.vary(time_step=best.time_step / 2.0), best.beta)
     actuation = problem.split(best.x)
 
     def numbers(values: np.ndarray) -> float | list[float]:
@@ -112,6 +113,7 @@ def summarise(result: Optimisation, start: np.ndarray) -> dict[str, Any]:
         "reference": _value_or_none(lambda: full_block(problem, start, best.x)),
         "optimised": best.objective,
         "post_processed": _value_or_none(lambda: post_processed(problem, best.x)),
+        "post_processed_half_step": _value_or_none(lambda: post_processed(half, best.x)),
         "greyness": best.greyness,
         "a": numbers(actuation.a),
         "theta": numbers(actuation.theta),

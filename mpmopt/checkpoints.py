@@ -86,10 +86,10 @@ class Schedule:
 
     @classmethod
     def choose(cls, steps: int, step_bytes: int, wish: Checkpointing) -> Schedule:
-        """The schedule that recomputes least within the budget.
+        """The schedule for a wish.
 
         All states stay in memory if they fit. Else segments of about sqrt(steps) steps need the
-        least memory; the store moves to disk if it does not fit either.
+        least memory, for one more forward run; the store moves to disk if it does not fit either.
         """
         root = math.isqrt(steps - 1) + 1
         if wish.every == "all":
@@ -104,7 +104,7 @@ class Schedule:
             if (segment + 1) * step_bytes > wish.memory:
                 segment = max(1, wish.memory // step_bytes - 1)
                 stored = math.ceil(steps / segment)
-        fits = (segment + 1 + stored) * step_bytes <= wish.memory
+        fits = stored == 1 or (segment + 1 + stored) * step_bytes <= wish.memory
         in_memory = wish.store == "memory" or (wish.store is None and fits)
         return cls(steps, segment, wish.every == "all", in_memory, step_bytes)
 
@@ -138,7 +138,7 @@ class Checkpoints:
     ----------
     schedule : Schedule
     arrays : mapping of str to (shape, dtype)
-        What is stored of each segment. Dataset NAME has the shape (segments, *shape).
+        What is stored of each segment. Each dataset begins with an axis of the segments.
     store : "memory", "disk", Path or None
         As in `Checkpointing`; a Path is kept.
 

@@ -73,9 +73,9 @@ class MovingAsymptotes:
     kkt_residual : float
         How far the x of the last step was from a Karush-Kuhn-Tucker point: the greatest of
         projected gradient of the Lagrangian, violation and complementarity. Dimensionless:
-        x is measured in ranges, f and g_i in units of their largest max_j |df/dx_j| range_j.
+        x is measured in ranges, f and g_i in units of their largest gradient entry times range.
     step_size : float
-        max_j |x_next_j - x_j| / range_j of the last step.
+        Greatest change of a variable in the last step, as a fraction of its range.
 
     Raises
     ------

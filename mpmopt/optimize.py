@@ -71,8 +71,7 @@ class Settings:
     sharpen_asymptotes : bool
         Initial asymptotes at 0.5 / (beta + 1) of the range instead of 0.5.
     best_first : bool
-        Start each stage from the best design of the last, with a fresh asymptote history, instead
-        of going on from the last design.
+        Start each stage from the best design of the one before, instead of its last design.
     window : int
         Iterations in the moving average of the stop rule.
     tolerance : float
@@ -185,7 +184,9 @@ class Optimisation:
 
     @property
     def result(self) -> Iteration:
-        """The best evaluation of the last stage that had one.
+        """The best evaluation: the one that goes farthest without void, where stages ask for that.
+
+        Else the best of the last stage that had one, whose projection is the sharpest.
 
         Raises
         ------
@@ -196,7 +197,10 @@ class Optimisation:
             raise SimulationError(
                 "every evaluation failed", 0, -1, (np.nan, np.nan), "see the history's failures"
             )
-        return self.best[max(self.best)]
+        return max(
+            self.best.values(),
+            key=lambda item: (np.nan_to_num(item.post_processed, nan=-np.inf), item.stage),
+        )
 
     def problem(self) -> Problem:
         """The problem that `result` solves, in the time step that it was evaluated with."""
@@ -223,7 +227,7 @@ def optimise(
     """Maximise the distance travelled, stage by stage.
 
     An evaluation that fails steps back to the stage's best design and halves the move limit,
-    which then recovers slowly. A stage whose very first design fails takes half its time step.
+    which then recovers slowly. A stage of which no design ran yet halves its time step instead.
 
     Parameters
     ----------
@@ -238,7 +242,7 @@ def optimise(
     Raises
     ------
     DesignError
-        If `start` does not fit the scene.
+        If `start` does not fit the scene, or there is nothing to design.
     SceneError
         If a stage cannot be simulated; all are checked before the first evaluation.
     StorageError
@@ -249,6 +253,8 @@ def optimise(
     callbacks = tuple(callbacks)
     began = time.monotonic()
     x = np.array(start, dtype=float)
+    if x.size == 0:
+        raise DesignError("the scene has no design variables: give it a Design or an Actuator")
     reason = ""
     for index, stage in enumerate(settings.stages):
         stage_run = _StageRun(run, index, stage, scenes[index], checkpointing, callbacks, began)

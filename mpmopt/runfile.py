@@ -5,7 +5,7 @@ Layout (version 1)::
     attributes       format, version, scene and settings (JSON), versions (JSON), stop_reason
     history/NAME     one entry per evaluation: objective, beta, greyness, step, ...
     stages/K/        best design of stage K: x, gamma; attributes of its evaluation
-    best/            that of the last stage, with phi, a, theta, b spelled out
+    best/            the best of all, with phi, a, theta, b spelled out; attribute stage
 """
 
 from __future__ import annotations
@@ -49,6 +49,8 @@ class RunFile:
         The best design of each stage that had one.
     time_steps : dict of int to float
         In which these were evaluated.
+    best_stage : int or None
+        Stage of the best design of all; None if no evaluation succeeded.
     stop_reason : str
         Empty if the run was not finished.
     """
@@ -59,31 +61,31 @@ class RunFile:
     history: dict[str, NDArray]
     designs: dict[int, NDArray[np.float64]]
     time_steps: dict[int, float]
+    best_stage: int | None
     stop_reason: str
 
     @property
-    def best_stage(self) -> int:
-        """The last stage that had a design.
+    def best(self) -> NDArray[np.float64]:
+        """The best design of all.
 
         Raises
         ------
         RunFileError
-            If none had: the run failed or was stopped before its first evaluation.
+            If there is none: the run failed or was stopped before its first evaluation.
         """
-        if not self.designs:
-            raise RunFileError("the run file holds no design: no evaluation succeeded")
-        return max(self.designs)
-
-    @property
-    def best(self) -> NDArray[np.float64]:
-        """The best design: that of the last stage that had one."""
-        return self.designs[self.best_stage]
+        return self.designs[self._stage(None)]
 
     def problem(self, stage: int | None = None) -> Problem:
         """The problem that a stage solved, by default that of the best design."""
-        index = self.best_stage if stage is None else stage
+        index = self._stage(stage)
         chosen = dataclasses.replace(self.settings.stages[index], time_step=self.time_steps[index])
         return Problem(chosen.scene(self.scene), chosen.beta)
+
+    def _stage(self, stage: int | None) -> int:
+        index = self.best_stage if stage is None else stage
+        if index not in self.designs:
+            raise RunFileError(f"the run file holds no design of stage {index}")
+        return index
 
 
 def write(path: Path, run: Optimisation) -> None:
@@ -151,6 +153,7 @@ def _fill(file: h5py.File, run: Optimisation) -> None:
     if run.best:
         x, gamma = run.result.x, run.result.gamma
         group = file.create_group("best")
+        group.attrs["stage"] = run.result.stage
         for name, value in {"gamma": gamma, **Variables.of(x, gamma.size)._asdict()}.items():
             group.create_dataset(name, data=value, dtype="f8")
 
@@ -199,6 +202,7 @@ def read(path: Path) -> RunFile:
                 versions=json.loads(file.attrs["versions"]),
                 history=history,
                 designs={stage: _numbers(file, f"stages/{stage}/x") for stage in stages},
+                best_stage=int(file["best"].attrs["stage"]) if "best" in file else None,
                 time_steps={k: float(file[f"stages/{k}"].attrs["time_step"]) for k in stages},
                 stop_reason=str(file.attrs["stop_reason"]),
             )

@@ -203,8 +203,8 @@ class Actuator(Region):
 class Wall(_Checked):
     """Axis-parallel rigid wall: nodes strictly behind it are clamped while they approach it.
 
-    Bodies touch it when their kernels do: the centre of a particle comes to rest about one cell
-    in front of `position`.
+    Bodies touch it when their kernels do, with a softness of about a cell; the lowest particles of
+    a resting body lie about at `position`.
 
     Parameters
     ----------

@@ -329,7 +329,8 @@ def complex_step_errors(
     Returns
     -------
     dict of str to float
-        abs(complex step - gradient.d) / abs(complex step), by the name of the direction.
+        abs(complex step - gradient.d) / abs(complex step), by the name of the direction. Where a
+        derivative is zero by symmetry both are rounding, and this says nothing.
     """
     rng = np.random.default_rng(seed)
     _, gradient = problem.value_and_gradient(x)

@@ -140,6 +140,18 @@ def test_a_stage_that_cannot_run_is_refused_before_any_evaluation(scene, start, 
     assert calls == []
 
 
+def test_a_scene_with_nothing_to_design_is_refused(scene):
+    bare = dataclasses.replace(scene, body=scene.body[2:3])
+    with pytest.raises(DesignError, match="no design variables"):
+        optimise(bare, QUICK, np.zeros(0))
+
+
+def test_the_result_is_the_design_that_goes_farthest_without_void(scene, start):
+    both = [dataclasses.replace(stage, solid=True) for stage in STAGES]
+    run = optimise(scene, dataclasses.replace(QUICK, stages=tuple(both)), start)
+    assert run.result.post_processed == max(item.post_processed for item in run.history)
+
+
 def test_a_start_that_does_not_fit_is_refused(scene):
     with pytest.raises(DesignError, match="variables"):
         optimise(scene, QUICK, np.zeros(3))

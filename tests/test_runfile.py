@@ -71,7 +71,7 @@ def test_an_unfinished_run_can_be_read(run, tmp_path):
     back = runfile.read(path)
     assert back.designs == {}
     assert back.stop_reason == ""
-    with pytest.raises(RunFileError, match="no design"):
+    with pytest.raises(RunFileError, match="no design of stage None"):
         _ = back.best
 
 
