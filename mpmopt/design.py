@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from mpmopt.errors import DesignError
 from mpmopt.mpm import interpolation
-from mpmopt.particles import Particles
+from mpmopt.particles import Particles, lay_out, mirror_images
 from mpmopt.scene import Material, Scene
 
 
@@ -17,10 +17,12 @@ def filter_matrix(scene: Scene, particles: Particles) -> scipy.sparse.csr_array[
 
     Particle to grid, 3 x 3 convolution, grid to particle. Only design particles take part; nodes
     that carry none are left out and the weights that remain are scaled to sum to one, so that a
-    constant field stays constant.
+    constant field stays constant. A mirror shows the filter the other half's particles, so that the
+    paper's mapping of one half to the other is what it does by itself.
     """
     rows = scene.grid.cells[1] + 1
-    position = particles.position[particles.designed]
+    body = lay_out(scene, whole=True)
+    position = body.position[body.designed]
     nodes, values = interpolation(position, scene.grid.dx, rows)
     carries = values > 0.0
     used, column = np.unique(nodes[carries], return_inverse=True)
@@ -47,7 +49,17 @@ def filter_matrix(scene: Scene, particles: Particles) -> scipy.sparse.csr_array[
         return scipy.sparse.diags_array(1.0 / matrix.sum(axis=1)) @ matrix
 
     to_grid = normalised(to_particles.T.tocsr())
-    return (to_particles @ (normalised(convolution) @ to_grid)).tocsr()
+    matrix = to_particles @ (normalised(convolution) @ to_grid)
+    if scene.mirror is None:
+        return matrix.tocsr()
+    # Rows of the simulated half; columns summed over a particle and its image.
+    kept = np.flatnonzero(position[:, scene.mirror.normal] < scene.mirror.position)
+    half, whole = particles.subset(particles.designed), body.subset(body.designed)
+    image = mirror_images(scene, half, whole)
+    spread = scipy.sparse.csr_array(
+        (np.ones(image.size), (np.arange(image.size), image)), shape=(image.size, kept.size)
+    )
+    return (matrix.tocsr()[kept] @ spread).tocsr()
 
 
 def project(phi: NDArray, beta: float) -> NDArray:

@@ -6,6 +6,7 @@ A step advances the particle states from t_n to t_n + dt (primes mark the new st
     stress       tau = mu (F'F'^T - I) + lambda ln J' I + s F' S F'^T
                  A   = m C - dt V c tau
     p2g          m_i = sum_p w_ip m,   q_i = sum_p w_ip (m v + A (x_i - x))
+    mirror       adds the images across a plane of symmetry, if the scene has one
     grid_update  u_i = wall(q_i / m_i + dt g)
     g2p          v'  = sum_i w_ip u_i,  C' = c sum_i w_ip u_i (x_i - x)^T,  x' = x + dt v'
 
@@ -59,6 +60,8 @@ class World(NamedTuple):
     wall_side: NDArray[np.int64]  # (W,) +1: clamps nodes below `wall_node`, -1: above
     wall_node: NDArray[np.int64]  # (W,)
     wall_friction: NDArray[np.float64]  # (W,) Coulomb coefficient, infinite: sticks
+    mirror_axis: int  # of the mirror plane's normal: 0 or 1; -1: no mirror
+    mirror_node: int  # line of nodes that is the plane
 
 
 class Body(NamedTuple):
@@ -148,6 +151,13 @@ def find_window(state, world):
     j0 = int(y_min / world.dx - 0.5)
     ni = int(x_max / world.dx - 0.5) + 3 - i0
     nj = int(y_max / world.dx - 0.5) + 3 - j0
+    # Nodes across a mirror need their images.
+    if world.mirror_axis == 0:
+        extra = max(0, i0 + (i0 + ni - 1) - 2 * world.mirror_node)
+        i0, ni = i0 - extra, ni + extra
+    elif world.mirror_axis == 1:
+        extra = max(0, j0 + (j0 + nj - 1) - 2 * world.mirror_node)
+        j0, nj = j0 - extra, nj + extra
     return i0, j0, ni, nj, -1
 
 
@@ -351,6 +361,31 @@ def p2g_adjoint(state, body, world, scratch, window, bar, body_bar):
 
 
 @jit
+def mirror(records, window, world):
+    """Add to each node what the mirrored half puts there; this map is its own transpose.
+
+    Records of nodes are (q_x, q_y, m, 0). With R the reflection, a node and its image across the
+    plane become r + R r_image and R r + r_image.
+    """
+    if world.mirror_axis < 0:
+        return
+    i0, j0, ni, nj = window
+    normal = world.mirror_axis
+    first, count, stride = (i0, ni, nj) if normal == 0 else (j0, nj, 1)
+    across, step = (nj, 1) if normal == 0 else (ni, nj)
+    plane = world.mirror_node - first
+    for line in range(across):
+        for k in range(count - plane):
+            node = line * step + (plane + k) * stride
+            image = line * step + (plane - k) * stride
+            for lane in range(3):
+                sign = -1.0 if lane == normal else 1.0
+                total = records[image, lane] + sign * records[node, lane]
+                records[image, lane] = total
+                records[node, lane] = sign * total
+
+
+@jit
 def wall(i, j, u, v, world):
     """Velocity of node (i, j) after the walls.
 
@@ -548,6 +583,7 @@ def advance(states, grids, windows, logs, first, last, body, world, signal, scra
             return n, INVERTED, particle
         stress(old, new, log_J, body, world, signal[n], scratch)
         p2g(old, body, world, scratch, window, grid)
+        mirror(grid, window, world)
         grid_update(grid, window, world, scratch)
         g2p(old, new, world, scratch, window)
     return last, DONE, -1
@@ -568,6 +604,7 @@ def advance_adjoint(states, grids, windows, logs, first, last, body, world, sign
         grid_update(grid, window, world, scratch)
         g2p_adjoint(old, new, world, scratch, window, bar)
         grid_update_adjoint(grid, window, world, scratch)
+        mirror(scratch.node_bar, window, world)
         p2g_adjoint(old, body, world, scratch, window, bar, body_bar)
         stress_adjoint(
             old, new, log_J, body, world, signal[n], scratch, bar, body_bar, signal_bar[n]

@@ -37,8 +37,15 @@ class Particles:
         )
 
 
-def lay_out(scene: Scene) -> Particles:
-    """Fill the body with a regular lattice of particles, column by column as nodes are stored."""
+def lay_out(scene: Scene, whole: bool = False) -> Particles:
+    """Fill the body with a regular lattice of particles, column by column as nodes are stored.
+
+    Parameters
+    ----------
+    scene : Scene
+    whole : bool, optional
+        Lay out both halves of a scene with a mirror, not only the simulated one.
+    """
     spacing = scene.grid.dx / scene.particles_per_cell
     columns, rows, designed, actuator = [], [], [], []
     actuators = 0
@@ -54,9 +61,30 @@ def lay_out(scene: Scene) -> Particles:
     i, j = np.concatenate(columns), np.concatenate(rows)
     order = np.lexsort((j, i))
     position = (np.stack([i, j], axis=1)[order] + 0.5) * spacing
-    return Particles(
+    particles = Particles(
         position=position,
         volume=np.full(len(position), spacing**2),
         designed=np.concatenate(designed)[order],
         actuator=np.concatenate(actuator)[order].astype(np.int64),
     )
+    if scene.mirror is None or whole:
+        return particles
+    return particles.subset(position[:, scene.mirror.normal] < scene.mirror.position)
+
+
+def mirror_images(scene: Scene, half: Particles, whole: Particles) -> NDArray[np.int64]:
+    """Index into the half's particles of each particle of the whole body, or of its image."""
+    mirror = scene.mirror
+    if mirror is None:
+        return np.arange(len(half.position))
+    spacing = scene.grid.dx / scene.particles_per_cell
+    folded = whole.position.copy()
+    across = folded[:, mirror.normal]
+    np.minimum(across, 2.0 * mirror.position - across, out=across)
+    row = round(scene.grid.size[1] / spacing)
+
+    def cell(position: NDArray[np.float64]) -> NDArray[np.int64]:
+        index = (position / spacing).astype(np.int64)
+        return index[:, 0] * row + index[:, 1]
+
+    return np.searchsorted(cell(half.position), cell(folded))

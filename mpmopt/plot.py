@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from mpmopt.optimize import Optimisation
 from mpmopt.problem import Problem
-from mpmopt.scene import Scene
+from mpmopt.scene import Mirror, Scene
 from mpmopt.simulate import Simulation
 
 
@@ -68,6 +68,18 @@ def draw_body(
     axes.add_collection(PolyCollection(list(polygons), facecolors=rgba, edgecolors="none"))
 
 
+def with_image(state: NDArray[np.float64], mirror: Mirror) -> NDArray[np.float64]:
+    """A state (12, N) and its mirror image (12, 2 N)."""
+    image = state.copy()
+    k, other = mirror.normal, 1 - mirror.normal
+    image[k] = 2.0 * mirror.position - state[k]
+    image[2 + k] *= -1.0
+    for block in (4, 8):  # C and F: one reflection from each side
+        image[block + 2 * k + other] *= -1.0
+        image[block + 2 * other + k] *= -1.0
+    return np.concatenate([state, image], axis=1)
+
+
 def plot_motion(
     path: Path, simulation: Simulation, gamma: NDArray[np.float64], title: str, pictures: int = 8
 ) -> None:
@@ -79,7 +91,7 @@ def plot_motion(
     simulation : Simulation
         Of N particles.
     gamma : (N,) array
-        What to draw of each particle.
+        What to draw of each particle; a scene's mirror image is drawn with it.
     title : str
     pictures : int, optional
     """
@@ -88,6 +100,9 @@ def plot_motion(
     states = simulation.run(list(frames))
     signal = np.abs(simulation.signal).max(initial=0.0)
     actuator = simulation.particles.actuator
+    if scene.mirror is not None:
+        states = np.array([with_image(state, scene.mirror) for state in states])
+        gamma, actuator = np.tile(gamma, 2), np.tile(actuator, 2)
     spacing = scene.grid.dx / scene.particles_per_cell
     low = states[:, 0:2].min(axis=(0, 2)) - 6 * spacing
     high = states[:, 0:2].max(axis=(0, 2)) + 6 * spacing

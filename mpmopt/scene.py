@@ -237,6 +237,38 @@ class Wall(_Checked):
 
 
 @dataclass(frozen=True)
+class Mirror(_Checked):
+    """Plane of symmetry: only the half below it is simulated, which is the same solution.
+
+    Parameters
+    ----------
+    axis : {"x", "y"}
+        Axis of the plane's normal.
+    position : float
+        Coordinate of the plane on that axis; on a line of nodes.
+    """
+
+    axis: Literal["x", "y"]
+    position: float
+
+    def __post_init__(self) -> None:
+        if self.axis not in ("x", "y"):
+            raise SceneError(f'Mirror: axis = {self.axis!r} must be "x" or "y"')
+        self._set(position=_number("Mirror", "position", self.position))
+
+    @property
+    def normal(self) -> int:
+        """Index of the axis."""
+        return "xy".index(self.axis)
+
+    def image(self, corner: Vector) -> Vector:
+        """Mirror image of a point."""
+        return tuple(  # type: ignore[return-value]
+            2.0 * self.position - c if k == self.normal else c for k, c in enumerate(corner)
+        )
+
+
+@dataclass(frozen=True)
 class Scene(_Checked):
     """One body, what surrounds it, and the way it shall go.
 
@@ -261,6 +293,8 @@ class Scene(_Checked):
         Particles per cell and direction.
     filter_weights : (float, float, float), optional
         Weights w0, w1, w2 of the design filter's 3 x 3 convolution: w0 + 4 w1 + 4 w2 = 1.
+    mirror : Mirror, optional
+        Plane about which all of the scene is symmetric. Body and walls are given whole.
 
     Raises
     ------
@@ -278,6 +312,7 @@ class Scene(_Checked):
     direction: Vector = (1.0, 0.0)
     particles_per_cell: int = 2
     filter_weights: tuple[float, float, float] = (0.64, 0.08, 0.01)
+    mirror: Mirror | None = None
 
     def __post_init__(self) -> None:
         for name, kind in (("grid", Grid), ("material", Material)):
@@ -315,6 +350,7 @@ class Scene(_Checked):
             )
         self._check_body()
         self._check_walls()
+        self._check_mirror()
         self._check_stability()
 
     def _check_body(self) -> None:
@@ -369,6 +405,66 @@ class Scene(_Checked):
                         f"Scene: {type(region).__name__} {region.lower} to {region.upper} reaches "
                         f"{depth:g} into the wall at {wall.axis} = {wall.position:g}"
                     )
+
+    def _check_mirror(self) -> None:
+        mirror = self.mirror
+        if mirror is None:
+            return
+        if not isinstance(mirror, Mirror):
+            raise SceneError("Scene: mirror must be a Mirror or None")
+        name, k, dx = (
+            f"Scene: mirror at {mirror.axis} = {mirror.position:g}",
+            mirror.normal,
+            self.grid.dx,
+        )
+        if abs(mirror.position / dx - round(mirror.position / dx)) > ROUNDING:
+            raise SceneError(
+                f"{name} is on no line of nodes; the nearest is at "
+                f"{round(mirror.position / dx) * dx:.10g}"
+            )
+        for what, vector in (("gravity", self.gravity), ("direction", self.direction)):
+            if vector[k] != 0.0:
+                raise SceneError(f"{name}: {what} {vector} has a component across it, must have 0")
+        spacing = dx / self.particles_per_cell
+
+        def cells(lower: Vector, upper: Vector) -> tuple[int, ...]:
+            return tuple(round(edge / spacing) for edge in (*lower, *upper))
+
+        there = {(type(region), cells(region.lower, region.upper)) for region in self.body}
+        for region in self.body:
+            low, high = mirror.image(region.lower), mirror.image(region.upper)
+            image = cells(
+                (min(low[0], high[0]), min(low[1], high[1])),
+                (max(low[0], high[0]), max(low[1], high[1])),
+            )
+            where = f"{type(region).__name__} {region.lower} to {region.upper}"
+            if (type(region), image) not in there:
+                raise SceneError(f"{name}: {where} has no mirror image in the body; add it")
+            if isinstance(region, Actuator) and (
+                image != cells(region.lower, region.upper) or region.stress[0][1] != 0.0
+            ):
+                raise SceneError(
+                    f"{name}: {where} must be its own mirror image with S_xy = 0, has S_xy = "
+                    f"{region.stress[0][1]:g}; simulate the whole body instead"
+                )
+        for wall in self.walls:
+            if wall.axis != mirror.axis:
+                continue
+            image_wall = dataclasses.replace(
+                wall,
+                position=2.0 * mirror.position - wall.position,
+                solid_side="above" if wall.solid_side == "below" else "below",
+            )
+            if not any(
+                abs(other.position - image_wall.position) < ROUNDING * dx
+                and (other.axis, other.solid_side, other.friction)
+                == (image_wall.axis, image_wall.solid_side, image_wall.friction)
+                for other in self.walls
+            ):
+                raise SceneError(
+                    f"{name}: the wall at {wall.axis} = {wall.position:g} has no mirror image at "
+                    f"{image_wall.position:g}; add it"
+                )
 
     def _check_stability(self) -> None:
         if self.time_step > self.largest_time_step:
@@ -462,8 +558,8 @@ class Scene(_Checked):
         except (json.JSONDecodeError, UnicodeDecodeError, TypeError, RecursionError) as error:
             raise SceneError(f"Scene: not JSON: {error}") from error
         data = dict(_object("Scene", data))
-        for name, part in (("grid", Grid), ("material", Material)):
-            if name in data:
+        for name, part in (("grid", Grid), ("material", Material), ("mirror", Mirror)):
+            if data.get(name) is not None:
                 data[name] = _build(part, data[name])
         if "body" in data:
             kinds = {part.kind: part for part in (Design, Solid, Actuator)}

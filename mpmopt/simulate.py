@@ -44,6 +44,8 @@ def world_of(scene: Scene) -> mpm.World:
         wall_friction=np.array(
             [np.inf if w.friction == "stick" else w.friction for w in scene.walls], dtype=float
         ),
+        mirror_axis=-1 if scene.mirror is None else scene.mirror.normal,
+        mirror_node=0 if scene.mirror is None else round(scene.mirror.position / dx),
     )
 
 

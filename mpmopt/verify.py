@@ -104,6 +104,11 @@ def kernel_mismatches(scene: Scene, seed: int = 0) -> dict[str, float]:
         )
         for name, (function, adjoint, keys) in tests.items()
     }
+    if scene.mirror is not None:
+        grid = {"grid": rng.standard_normal((bench.nodes, 3))}
+        result["mirror"] = dot_product_mismatch(
+            bench.mirror, lambda v, w: {"grid": bench.mirror(w)["grid"]}, grid, rng
+        )
     chain, objective = DesignChain(scene, bench.particles, 2.0), bench.objective
     result["design"] = dot_product_mismatch(
         lambda v: dict(zip(("rho", "la", "mu"), chain.material(v["phi"]))),
@@ -271,6 +276,12 @@ class _Bench:
             "affine": scratch.affine_bar,
             "mass": body_bar.mass,
         }
+
+    def mirror(self, v: Arrays) -> Arrays:
+        records = np.zeros((self.nodes, mpm.NODE_SIZE), v["grid"].dtype)
+        records[:, :3] = v["grid"]
+        mpm.mirror(records, self.window, self.world)
+        return {"grid": records[:, :3]}
 
     def _grid(self, v: Arrays, dtype: type) -> NDArray:
         grid = np.zeros((self.nodes, mpm.NODE_SIZE), dtype)
