@@ -8,7 +8,7 @@ design can be compared, but not distances.
 
 import sys
 
-from mpmopt.case import Case, main
+from mpmopt.case import MOST_ITERATIONS, Case, main, refining, sharpening
 from mpmopt.optimize import Settings, Stage
 from mpmopt.scene import Actuator, Design, Grid, Scene, Solid, Wall
 
@@ -31,30 +31,12 @@ def walker(cells: int, time_step: float) -> Scene:
     )
 
 
-def stages(time_step: float, betas: int = 7, late: int = 3) -> tuple[Stage, ...]:
-    """Beta doubled from 0.5, the mass floor halved with it; half the step from stage `late` on."""
-    return tuple(
-        Stage(
-            beta=0.5 * 2**k,
-            mass_floor=1e-2 * 0.5**k,
-            stiffness_floor=1e-3,
-            time_step=time_step if k < late else time_step / 2,
-            solid=k >= betas - 2,
-        )
-        for k in range(betas)
-    )
-
-
 CASES = {
     "default": Case(
-        walker(128, 5e-4),
-        Settings(
-            tuple(Stage(0.5 * 2**k, 1e-2, 1e-3, 5e-4, solid=k > 3) for k in range(6)),
-            most_iterations=25,
-        ),
+        walker(128, 5e-4), Settings(refining(8e-4, 5e-4), most_iterations=MOST_ITERATIONS)
     ),
-    "preview": Case(walker(64, 8e-4), Settings(stages(8e-4), most_iterations=25)),
-    # MMA with its usual constants, going on from the last design as beta doubles.
+    "preview": Case(walker(64, 8e-4), Settings(sharpening(8e-4), most_iterations=MOST_ITERATIONS)),
+    # Moving asymptotes as published, going on from the last design as beta doubles.
     "paper": Case(
         walker(128, 2e-4),
         Settings(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import label
 
 from mpmopt.actuation import signal
 from mpmopt.errors import DesignError
@@ -71,10 +72,35 @@ def post_processed(problem: Problem, x: NDArray, threshold: float = THRESHOLD) -
     return distance(problem.scene, problem.gamma(x) >= threshold, problem.split(x))
 
 
-def full_block(problem: Problem, *designs: NDArray) -> float:
-    """Objective L of the reference: the design domain all solid, with the best actuation of some.
+def loose(scene: Scene, keep: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Kept design particles that hang on nothing: no chain of neighbours leads to a solid region.
 
-    The simplest body that one would draw. L is the largest over the actuations of `designs`.
+    Parameters
+    ----------
+    scene : Scene
+    keep : (D,) array of bool
+        Design particles that are there.
+
+    Returns
+    -------
+    (D,) array of bool
     """
-    keep = np.ones(problem.gamma(designs[0]).size, dtype=bool)
-    return max(distance(problem.scene, keep, problem.split(x)) for x in designs)
+    particles = lay_out(scene)
+    there = ~particles.designed
+    there[particles.designed] = keep
+    index = np.floor(particles.position * scene.particles_per_cell / scene.grid.dx).astype(int)
+    i, j = (index - index.min(axis=0)).T
+    lattice = np.zeros((i.max() + 1, j.max() + 1), dtype=bool)
+    lattice[i, j] = there
+    pieces = label(lattice)[0][i, j]
+    held = np.isin(pieces, pieces[~particles.designed])
+    return (there & ~held)[particles.designed]
+
+
+def full_block(scene: Scene, *actuations: Variables) -> float:
+    """Objective L of the reference: the design domain all solid, with the best of some actuations.
+
+    The simplest body that one would draw.
+    """
+    keep = np.ones(int(lay_out(scene).designed.sum()), dtype=bool)
+    return max(distance(scene, keep, actuation) for actuation in actuations)

@@ -9,19 +9,21 @@ import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any
 
 import numpy as np
 from tqdm import tqdm
 
 from mpmopt import runfile
-from mpmopt.binary import full_block, post_processed
+from mpmopt.binary import THRESHOLD, full_block, loose, post_processed
 from mpmopt.checkpoints import Checkpointing
 from mpmopt.errors import MpmoptError, SimulationError, StorageError
-from mpmopt.optimize import Optimisation, Settings, optimise
-from mpmopt.problem import Problem
+from mpmopt.optimize import Optimisation, Settings, Stage, optimise
+from mpmopt.problem import Problem, Variables
 from mpmopt.scene import Scene
 
+MOST_ITERATIONS = 25  # of a stage: more of them only polish what the next stage changes
 START = {"phi": 0.0, "a": 1.0, "theta": -0.3, "b": -0.5}
 
 
@@ -39,12 +41,36 @@ class Case:
     settings: Settings
 
 
+def sharpening(time_step: float, stages: int = 7, coarsening: int = 1) -> tuple[Stage, ...]:
+    """Stages of a coarse grid: void loses weight as it becomes distinct.
+
+    Beta is doubled from 0.5 and the mass floor halved from 1e-2; from the fourth stage on the void
+    is so light that it needs half the time step. The sixth and later ones are judged without void.
+    """
+    return tuple(
+        Stage(
+            beta=0.5 * 2**k,
+            mass_floor=1e-2 * 0.5**k,
+            stiffness_floor=1e-3,
+            time_step=time_step if k < 3 else time_step / 2,
+            solid=k >= 5,
+            coarsening=coarsening,
+        )
+        for k in range(stages)
+    )
+
+
+def refining(coarse_time_step: float, time_step: float) -> tuple[Stage, ...]:
+    """Find the gait on cells twice as wide, then the shape: beta 8, 16 and 32 on the scene's own."""
+    fine = (Stage(beta, 1e-2, 1e-3, time_step, solid=True) for beta in (8.0, 16.0, 32.0))
+    return (*sharpening(coarse_time_step, stages=5, coarsening=2), *fine)
+
+
 class ProgressBar:
     """Callback of `optimise` that shows objective, beta and greyness; log lines off a terminal."""
 
     def __init__(self) -> None:
         self._bar = tqdm(unit=" gradients", disable=not sys.stderr.isatty())
-        self._best: dict[int, float] = {}
 
     def __call__(self, run: Optimisation) -> None:
         last = run.history[-1]
@@ -81,8 +107,10 @@ def run(case: Case, out: Path, checkpointing: Checkpointing | None = None) -> di
         raise StorageError(f"{path} holds an earlier run; choose another folder or move it away")
     try:
         out.mkdir(parents=True, exist_ok=True)
+        with TemporaryFile(dir=out):
+            pass
     except OSError as error:
-        raise StorageError(f"cannot make {out}: {error}; choose another folder") from error
+        raise StorageError(f"cannot write to {out}: {error}; choose another folder") from error
     first = case.settings.stages[0]
     start = Problem(first.scene(case.scene), first.beta).join(**START)
     result = optimise(
@@ -92,27 +120,30 @@ def run(case: Case, out: Path, checkpointing: Checkpointing | None = None) -> di
         [lambda current: runfile.write(path, current), ProgressBar()],
         checkpointing,
     )
-    summary = summarise(result, start)
+    summary = summarise(result)
     text = json.dumps(summary, indent=1) + "\n"
     runfile.replace_file(out / "summary.json", text.encode())
     _draw(out, result, summary)
     return summary
 
 
-def summarise(result: Optimisation, start: np.ndarray) -> dict[str, Any]:
+def summarise(result: Optimisation) -> dict[str, Any]:
     """Objective values (L, larger is farther), actuation and counts of a finished optimisation."""
     best, problem = result.result, result.problem()
     half = Problem(problem.scene.vary(time_step=best.time_step / 2.0), best.beta)
-    actuation = problem.split(best.x)
+    first = result.history[0]
+    actuations = [Variables.of(item.x, item.gamma.size) for item in (first, best)]
+    actuation = actuations[1]
 
     def numbers(values: np.ndarray) -> float | list[float]:
         return float(values[0]) if values.size == 1 else values.tolist()
 
     return {
-        "start": _value_or_none(lambda: result.history[0].objective),
-        "reference": _value_or_none(lambda: full_block(problem, start, best.x)),
+        "start": _value_or_none(lambda: first.objective),
+        "reference": _value_or_none(lambda: full_block(problem.scene, *actuations)),
         "optimised": best.objective,
         "post_processed": _value_or_none(lambda: post_processed(problem, best.x)),
+        "loose_particles": int(loose(problem.scene, problem.gamma(best.x) >= THRESHOLD).sum()),
         "post_processed_half_step": _value_or_none(lambda: post_processed(half, best.x)),
         "greyness": best.greyness,
         "a": numbers(actuation.a),
@@ -167,7 +198,7 @@ def main(description: str, cases: Mapping[str, Case], argv: list[str] | None = N
     Returns
     -------
     int
-        Exit code: 0, or 1 with a message on standard error.
+        Exit code: 0, 1 with a message on standard error, or 130 if interrupted.
     """
     parser = argparse.ArgumentParser(description=description)
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of results")
@@ -181,10 +212,14 @@ def main(description: str, cases: Mapping[str, Case], argv: list[str] | None = N
             )
     arguments = parser.parse_args(argv)
     logging.basicConfig(format="%(message)s")
+    setting = getattr(arguments, "setting", None) or "default"
     try:
-        summary = run(cases[arguments.setting or "default"], arguments.out)
+        summary = run(cases[setting], arguments.out)
     except MpmoptError as error:
         print(f"{type(error).__name__}: {error}", file=sys.stderr)
         return 1
+    except KeyboardInterrupt:
+        print(f"Interrupted; {arguments.out / 'run.h5'} holds the run so far.", file=sys.stderr)
+        return 130
     print(table(summary))
     return 0

@@ -11,14 +11,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Literal
+from uuid import uuid4
 
 import h5py
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from mpmopt.checks import count, number
 from mpmopt.errors import DesignError, StorageError
 
 MEGABYTE = 1_000_000
+FORMAT = "mpmopt checkpoints"
 
 
 @dataclass(frozen=True)
@@ -47,14 +50,14 @@ class Checkpointing:
     store: Path | Literal["memory", "disk"] | None = None
 
     def __post_init__(self) -> None:
-        if self.every not in (None, "all") and not (
-            isinstance(self.every, int) and self.every >= 1
-        ):
-            raise DesignError(f'every = {self.every!r} must be a whole number >= 1 or "all"')
-        if not self.memory > 0:
-            raise DesignError(f"memory = {self.memory!r} bytes must be above 0")
+        name = "Checkpointing"
+        if self.every not in (None, "all"):
+            every = count(name, 'every (or "all")', self.every, 1, error=DesignError)
+            object.__setattr__(self, "every", every)
+        memory = number(name, "memory", self.memory, above=0.0, error=DesignError)
+        object.__setattr__(self, "memory", int(memory))
         if self.store not in (None, "memory", "disk") and not isinstance(self.store, Path):
-            raise DesignError(f'store = {self.store!r} must be "memory", "disk" or a Path')
+            raise DesignError(f'{name}: store = {self.store!r} must be "memory", "disk" or a Path')
 
 
 @dataclass(frozen=True)
@@ -129,7 +132,7 @@ class Schedule:
 
 
 class Checkpoints:
-    """HDF5 file with room for arrays of every segment, removed at the end unless it was asked for.
+    """HDF5 file with room for arrays of every segment, removed at the end unless it is to be kept.
 
     All its room is taken before the first step: a disk that is full, or that fills up meanwhile,
     costs no computed step, and HDF5, which does not survive it, never meets a write that fails.
@@ -140,12 +143,12 @@ class Checkpoints:
     arrays : mapping of str to (shape, dtype)
         What is stored of each segment. Each dataset begins with an axis of the segments.
     store : "memory", "disk", Path or None
-        As in `Checkpointing`; a Path is kept.
+        As in `Checkpointing`; a Path is kept, once complete, and may replace an older store.
 
     Raises
     ------
     StorageError
-        If the file cannot be made or the disk has too little room.
+        If the file cannot be made, would replace a foreign one, or the disk has too little room.
     """
 
     def __init__(
@@ -155,19 +158,24 @@ class Checkpoints:
         store: Path | Literal["memory", "disk"] | None = None,
     ) -> None:
         self.schedule = schedule
-        self.path: Path | None = store if isinstance(store, Path) else None
-        self._keep = self.path is not None
+        self._target = store if isinstance(store, Path) else None
+        self.path: Path | None = None
         if schedule.in_memory:
+            name = f"checkpoints-{uuid4()}"  # HDF5 knows files by their names
             self._file = h5py.File(
-                "checkpoints", "w", driver="core", backing_store=False, block_size=MEGABYTE
+                name, "w", driver="core", backing_store=False, block_size=MEGABYTE
             )
             self._lay_out(arrays)
             return
+        if self._target is not None and self._target.exists() and not _is_store(self._target):
+            raise StorageError(
+                f"{self._target} exists and holds no checkpoints; choose another name"
+            )
         try:
-            if self.path is None:
-                handle, name = tempfile.mkstemp(prefix="mpmopt-", suffix=".h5")
-                os.close(handle)
-                self.path = Path(name)
+            folder = None if self._target is None else self._target.parent
+            handle, name = tempfile.mkstemp(prefix="mpmopt-", suffix=".h5", dir=folder)
+            os.close(handle)
+            self.path = Path(name)
             sizes = (
                 np.dtype(dtype).itemsize * math.prod(shape) for shape, dtype in arrays.values()
             )
@@ -180,18 +188,19 @@ class Checkpoints:
         except OSError as error:
             self._remove()
             raise StorageError(
-                f"no room for checkpoints of {schedule.stored_bytes / MEGABYTE:.1f} MB in "
-                f"{self.path}: {error}; store fewer states (Checkpointing.every), or put them "
-                "elsewhere (Checkpointing.store, or the environment variable TMPDIR)"
+                f"no room for checkpoints of {schedule.stored_bytes / MEGABYTE:.3g} MB in "
+                f"{self.path or folder}: {error}; store fewer states (Checkpointing.every), or put "
+                "them elsewhere (Checkpointing.store, or the environment variable TMPDIR)"
             ) from error
 
     def _lay_out(self, arrays: Mapping[str, tuple[tuple[int, ...], DTypeLike]]) -> None:
-        count = len(self.schedule.segments)
+        self._file.attrs["format"] = FORMAT
+        segments = len(self.schedule.segments)
         settings = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
         settings.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
         settings.set_fill_time(h5py.h5d.FILL_TIME_NEVER)
         for name, (shape, dtype) in arrays.items():
-            space = h5py.h5s.create_simple((count, *shape))
+            space = h5py.h5s.create_simple((segments, *shape))
             kind = h5py.h5t.py_create(np.dtype(dtype))
             h5py.h5d.create(self._file.id, name.encode(), kind, space, dcpl=settings)
 
@@ -200,7 +209,7 @@ class Checkpoints:
         with self.path.open("ab") as file:
             free = shutil.disk_usage(self.path.parent).free
             if free < size:
-                raise OSError(f"{size / MEGABYTE:.1f} MB needed, {free / MEGABYTE:.1f} MB free")
+                raise OSError(f"{size / MEGABYTE:.3g} MB needed, {free / MEGABYTE:.3g} MB free")
             if hasattr(os, "posix_fallocate"):
                 os.posix_fallocate(file.fileno(), 0, size)
 
@@ -227,10 +236,21 @@ class Checkpoints:
             ) from error
 
     def close(self) -> None:
-        """Close the store, and remove it unless it is to be kept."""
+        """Close the store; move it to the place that was asked for, or remove it.
+
+        Raises
+        ------
+        StorageError
+            If it cannot be moved there.
+        """
         self._file.close()
-        if not self._keep:
-            self._remove()
+        if self.path is not None and self._target is not None:
+            try:
+                os.replace(self.path, self._target)
+            except OSError as error:
+                self._remove()
+                raise StorageError(f"cannot keep checkpoints as {self._target}: {error}") from error
+        self._remove()
 
     def _remove(self) -> None:
         if self.path is not None:
@@ -245,4 +265,15 @@ class Checkpoints:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
+        if kind is not None:
+            self._target = None  # incomplete
         self.close()
+
+
+def _is_store(path: Path) -> bool:
+    """Whether a file holds checkpoints of an earlier run."""
+    try:
+        with h5py.File(path, "r") as file:
+            return bool(file.attrs.get("format") == FORMAT)
+    except OSError:
+        return False

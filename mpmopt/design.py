@@ -32,7 +32,10 @@ def filter_matrix(scene: Scene, particles: Particles) -> scipy.sparse.csr_array[
 
     w0, w1, w2 = scene.filter_weights
     i, j = np.divmod(used, rows)
-    number = np.full((scene.grid.cells[0] + 3, rows + 2), -1)  # with a margin of empty nodes
+    i, j = (index - min(index, default=0) for index in (i, j))
+    number = np.full(
+        (max(i, default=0) + 3, max(j, default=0) + 3), -1
+    )  # with a margin of empty nodes
     number[i + 1, j + 1] = np.arange(used.size)
     pairs, shares = [], []
     for di in (-1, 0, 1):
@@ -69,7 +72,7 @@ def project(phi: NDArray, beta: float) -> NDArray:
 
 def project_adjoint(phi: NDArray, beta: float, gamma_bar: NDArray) -> NDArray:
     """phi_bar from gamma_bar."""
-    return gamma_bar * 0.5 * beta / np.tanh(beta) / np.cosh(beta * phi) ** 2
+    return gamma_bar * 0.5 * beta / np.tanh(beta) * (1.0 - np.tanh(beta * phi) ** 2)
 
 
 def greyness(gamma: NDArray) -> float:
@@ -103,12 +106,12 @@ class DesignChain:
         self._material = scene.material
 
     def gamma(self, phi: NDArray) -> NDArray:
-        """Material density (D,) of the design particles, within [0, 1]."""
+        """Material density (D,) of the design particles, within [0, 1] but for rounding."""
         return project(self.filter @ phi, self.beta)
 
     def material(self, phi: NDArray) -> tuple[NDArray, NDArray, NDArray]:
         """rho, lambda and mu of all particles, (N,) each."""
-        gamma = np.ones(self._designed.size, dtype=np.asarray(phi).dtype)
+        gamma = np.ones(self._designed.size, dtype=np.result_type(phi, float))
         gamma[self._designed] = self.gamma(phi)
         return interpolate(self._material, gamma)
 

@@ -586,7 +586,8 @@ def advance(states, grids, windows, logs, first, last, body, world, signal, scra
         mirror(grid, window, world)
         grid_update(grid, window, world, scratch)
         g2p(old, new, world, scratch, window)
-    return last, DONE, -1
+    particle = find_window(states[last % states.shape[0]], world)[4]
+    return last, DONE if particle < 0 else ESCAPED, particle
 
 
 @jit

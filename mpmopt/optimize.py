@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from mpmopt.binary import post_processed
 from mpmopt.checkpoints import Checkpointing
+from mpmopt.checks import count, number
 from mpmopt.design import greyness
 from mpmopt.errors import DesignError, SimulationError
 from mpmopt.mma import MovingAsymptotes
@@ -23,6 +24,8 @@ logger = logging.getLogger(__name__)
 
 # Factors on the move limit after a step that went back, and after one that went on.
 SHORTEN, LENGTHEN = 0.6, 1.2
+# How often a stage of which no design runs halves its time step before the run gives up.
+HALVINGS = 3
 
 
 @dataclass(frozen=True)
@@ -39,6 +42,8 @@ class Stage:
     solid : bool
         Whether the best design is the one that goes farthest once its void is removed
         (`binary.post_processed`), which costs a forward run more, instead of as it is.
+    coarsening : int
+        How many of the scene's cells go into the width of this stage's: early stages need no more.
     """
 
     beta: float
@@ -46,6 +51,14 @@ class Stage:
     stiffness_floor: float
     time_step: float
     solid: bool = False
+    coarsening: int = 1
+
+    def __post_init__(self) -> None:
+        for name in ("beta", "mass_floor", "stiffness_floor", "time_step"):
+            value = number("Stage", name, getattr(self, name), above=0.0, error=DesignError)
+            object.__setattr__(self, name, value)
+        coarsening = count("Stage", "coarsening", self.coarsening, 1, error=DesignError)
+        object.__setattr__(self, "coarsening", coarsening)
 
     def scene(self, scene: Scene) -> Scene:
         """The scene as this stage simulates it."""
@@ -53,6 +66,7 @@ class Stage:
             time_step=self.time_step,
             mass_floor=self.mass_floor,
             stiffness_floor=self.stiffness_floor,
+            coarsening=self.coarsening,
         )
 
 
@@ -99,11 +113,17 @@ class Settings:
     most_failures: int = 8
 
     def __post_init__(self) -> None:
-        if not self.stages:
-            raise DesignError("Settings: stages is empty; give at least one")
+        if not self.stages or not all(isinstance(stage, Stage) for stage in self.stages):
+            raise DesignError(f"Settings: stages = {self.stages!r} must be Stages, at least one")
+        object.__setattr__(self, "stages", tuple(self.stages))
         for name in ("window", "least_iterations", "most_iterations", "most_failures"):
-            if not getattr(self, name) >= 1:
-                raise DesignError(f"Settings: {name} = {getattr(self, name)} must be at least 1")
+            object.__setattr__(
+                self, name, count("Settings", name, getattr(self, name), 1, error=DesignError)
+            )
+        for name in ("move_limit", "tolerance"):
+            object.__setattr__(
+                self, name, number("Settings", name, getattr(self, name), error=DesignError)
+            )
         if self.least_iterations > self.most_iterations:
             raise DesignError(
                 f"Settings: least_iterations = {self.least_iterations} is above "
@@ -111,7 +131,7 @@ class Settings:
             )
         if not 0.0 < self.move_limit <= 1.0:
             raise DesignError(f"Settings: move_limit = {self.move_limit} must be in (0, 1]")
-        if not self.tolerance >= 0.0:
+        if self.tolerance < 0.0:
             raise DesignError(f"Settings: tolerance = {self.tolerance} must not be negative")
 
 
@@ -190,13 +210,12 @@ class Optimisation:
 
         Raises
         ------
-        SimulationError
-            If every evaluation failed.
+        DesignError
+            If no evaluation succeeded.
         """
         if not self.best:
-            raise SimulationError(
-                "every evaluation failed", 0, -1, (np.nan, np.nan), "see the history's failures"
-            )
+            last = self.history[-1].failure if self.history else "none was made"
+            raise DesignError(f"no evaluation succeeded; the last: {last}")
         return max(
             self.best.values(),
             key=lambda item: (np.nan_to_num(item.post_processed, nan=-np.inf), item.stage),
@@ -234,7 +253,7 @@ def optimise(
     scene : Scene
     settings : Settings
     start : (n,) array
-        First design, within [-1, 1] (`Problem.join` makes it).
+        First design, within [-1, 1], of the first stage's scene (`Problem.join` makes it).
     callbacks : iterable of callable
         Called after each evaluation and once at the end.
     checkpointing : Checkpointing, optional
@@ -258,6 +277,8 @@ def optimise(
     reason = ""
     for index, stage in enumerate(settings.stages):
         stage_run = _StageRun(run, index, stage, scenes[index], checkpointing, callbacks, began)
+        if index > 0 and stage.coarsening != settings.stages[index - 1].coarsening:
+            x = stage_run.problem.transfer(Problem(scenes[index - 1]), x)
         x, reason, gave_up = stage_run.climb(x)
         logger.info("stage %d (beta %g): %s", index, stage.beta, reason)
         if gave_up:
@@ -306,7 +327,8 @@ class _StageRun:
             evaluated = self._evaluate(x, mma.move_limit)
             if evaluated is None:
                 failures += 1
-                if failures >= settings.most_failures:
+                none_ran = self.best_gradient is None
+                if failures >= settings.most_failures or (none_ran and failures > HALVINGS):
                     why = f"it gave up after {failures} failed evaluations in a row."
                     return x, why, True
                 best = self.run.best.get(self.index)
@@ -341,6 +363,8 @@ class _StageRun:
             logger.warning("evaluation %d failed: %s", len(run.history), error)
         solid = self._without_void(x) if self.stage.solid and not failure else np.nan
         before = run.history[-1].x if run.history else x
+        if before.size != x.size:  # another grid
+            before = x
         free = np.where(gradient > 0.0, x < 1.0, x > -1.0)
         gamma = self.problem.gamma(x)
         iteration = Iteration(

@@ -50,8 +50,7 @@ def lay_out(scene: Scene, whole: bool = False) -> Particles:
     columns, rows, designed, actuator = [], [], [], []
     actuators = 0
     for region in scene.body:
-        i0, j0 = (round(edge / spacing) for edge in region.lower)
-        i1, j1 = (round(edge / spacing) for edge in region.upper)
+        (i0, j0), (i1, j1) = scene.lattice(region)
         i, j = (index.ravel() for index in np.meshgrid(range(i0, i1), range(j0, j1)))
         columns.append(i)
         rows.append(j)

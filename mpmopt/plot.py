@@ -60,7 +60,8 @@ def draw_body(
     corners = 0.5 * spacing * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
     F = state[8:12].T.reshape(-1, 2, 2)
     polygons = state[0:2].T[:, None] + np.einsum("pij,kj->pki", F, corners)
-    colour = np.repeat(0.85 * (1.0 - np.clip(gamma, 0.0, 1.0))[:, None], 3, axis=1)
+    gamma = np.clip(gamma, 0.0, 1.0)
+    colour = np.repeat(0.85 * (1.0 - gamma)[:, None], 3, axis=1)
     strength = np.clip(np.abs(actuation), 0.0, 1.0)[:, None]
     tint = np.where(actuation[:, None] > 0.0, [0.85, 0.1, 0.1], [0.1, 0.25, 0.85])
     colour = (1.0 - strength) * colour + strength * tint

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from mpmopt.actuation import signal, signal_adjoint
 from mpmopt.checkpoints import Checkpointing
@@ -72,10 +73,20 @@ class Problem:
         self.size = self._designed + 3 * len(scene.actuators)
 
     def join(self, phi: Any, a: Any, theta: Any, b: Any) -> NDArray[np.float64]:
-        """The vector x of named variables; single numbers stand for all entries."""
-        shapes = (self._designed,) + 3 * (len(self.scene.actuators),)
-        parts = [np.broadcast_to(v, n) for v, n in zip((phi, a, theta, b), shapes, strict=True)]
-        return np.concatenate(parts).astype(float)
+        """The vector x of named variables; single numbers stand for all entries.
+
+        Raises
+        ------
+        DesignError
+            If a shape does not fit or an entry is no real number.
+        """
+        sizes = (self._designed,) + 3 * (len(self.scene.actuators),)
+        parts = []
+        for name, value, size in zip(Variables._fields, (phi, a, theta, b), sizes):
+            if np.size(value) not in (1, size) or np.ndim(value) > 1:
+                raise DesignError(f"{name} has shape {np.shape(value)}, must have {(size,)} or ()")
+            parts.append(np.broadcast_to(_real(name, value), size))
+        return np.concatenate(parts)
 
     def split(self, x: NDArray) -> Variables:
         """The named variables of a vector x.
@@ -86,6 +97,7 @@ class Problem:
             If x has another size, or an entry is not finite or outside [-1, 1].
         """
         x = np.asarray(x)
+        x = x if x.dtype == complex else _real("x", x)
         if x.shape != (self.size,):
             raise DesignError(f"x has shape {x.shape}, this problem's variables {(self.size,)}")
         outside = ~(np.abs(x.real) <= 1.0)
@@ -95,6 +107,16 @@ class Problem:
                 f"is x[{outside.argmax()}] = {x[outside.argmax()]}"
             )
         return Variables.of(x, self._designed)
+
+    def transfer(self, other: Problem, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The design x of another problem as one of this problem, whose grid is another.
+
+        Each design particle takes phi from the nearest one of the other problem's.
+        """
+        positions = [p.particles.position[p.particles.designed] for p in (other, self)]
+        parts = other.split(x)
+        phi = parts.phi[cKDTree(positions[0]).query(positions[1])[1]] if self._designed else 0.0
+        return self.join(phi, parts.a, parts.theta, parts.b)
 
     def gamma(self, x: NDArray) -> NDArray:
         """Material density (D,) of the design particles."""
@@ -133,7 +155,7 @@ class Problem:
         StorageError
             If checkpoints cannot be stored or read back.
         """
-        phi, a, theta, _ = self.split(x)
+        phi, a, theta, _ = self.split(_real("x", x))
         simulation = self.simulation(x)
         with simulation.checkpoints(self.checkpointing) as checkpoints:
             forward = simulation.forward(checkpoints)
@@ -142,6 +164,13 @@ class Problem:
         phi_bar = self.chain.pullback(phi, bars.density, bars.lame_lambda, bars.lame_mu)
         gradient = np.concatenate([phi_bar, *signal_adjoint(self.scene, a, theta, bars.signal)])
         return value, _finite(gradient, simulation)
+
+
+def _real(name: str, value: Any) -> NDArray[np.float64]:
+    array = np.asarray(value)
+    if not (np.issubdtype(array.dtype, np.floating) or np.issubdtype(array.dtype, np.integer)):
+        raise DesignError(f"{name} holds {array.dtype}, must hold real numbers")
+    return array.astype(float)
 
 
 def _finite(values: Any, simulation: Simulation) -> Any:

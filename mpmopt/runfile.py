@@ -18,6 +18,7 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 import h5py
 import numpy as np
@@ -97,11 +98,11 @@ def write(path: Path, run: Optimisation) -> None:
         If the file cannot be written; an older one is still whole.
     """
     # HDF5 does not survive a write that fails, so it writes to memory only.
-    with h5py.File("run", "w", driver="core", backing_store=False) as file:
+    with h5py.File(f"run-{uuid4()}", "w", driver="core", backing_store=False) as file:
         _fill(file, run)
         file.flush()
         image = file.id.get_file_image()
-    replace_file(path, image)
+    replace_file(Path(path), image)
 
 
 def replace_file(path: Path, content: bytes) -> None:
@@ -180,6 +181,7 @@ def read(path: Path) -> RunFile:
     RunFileError
         If it does not exist, is no run file, is damaged or of another version.
     """
+    path = Path(path)
     if not path.is_file():
         raise RunFileError(f"{path} is not there; give the path of a run.h5")
     try:
@@ -196,6 +198,10 @@ def read(path: Path) -> RunFile:
             history: dict[str, Any] = {name: _numbers(file, f"history/{name}") for name in COLUMNS}
             history["failure"] = file["history/failure"].asstr()[:]
             stages = sorted(int(name) for name in file["stages"]) if "stages" in file else []
+            if any(not 0 <= stage < len(settings["stages"]) for stage in stages):
+                raise ValueError(f"designs of stages {stages} of {len(settings['stages'])}")
+            if len({len(column) for column in history.values()}) != 1:
+                raise ValueError("the history's columns have different lengths")
             return RunFile(
                 scene=Scene.from_json(file.attrs["scene"]),
                 settings=Settings(**settings),

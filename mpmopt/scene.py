@@ -11,6 +11,7 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
+from mpmopt.checks import MOST, count, number
 from mpmopt.errors import SceneError
 
 Vector = tuple[float, float]
@@ -19,22 +20,6 @@ Vector = tuple[float, float]
 LARGEST_SIGNAL = 2.0
 # Edges may miss a lattice line by rounding, in units of its spacing.
 ROUNDING = 1e-6
-
-
-def _number(owner: str, name: str, value: Any, *, above: float = -math.inf) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float, np.number)):
-        raise SceneError(f"{owner}: {name} = {value!r} must be a number")
-    value = float(value)
-    if not math.isfinite(value) or not value > above:
-        limit = "finite" if above == -math.inf else f"finite and above {above:g}"
-        raise SceneError(f"{owner}: {name} = {value!r} must be {limit}")
-    return value
-
-
-def _count(owner: str, name: str, value: Any, least: int) -> int:
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
-        raise SceneError(f"{owner}: {name} = {value!r} must be a whole number >= {least}")
-    return int(value)
 
 
 def _tuple(owner: str, name: str, value: Any, check: Callable[[Any], Any], length: int) -> tuple:
@@ -48,7 +33,7 @@ def _tuple(owner: str, name: str, value: Any, check: Callable[[Any], Any], lengt
 
 
 def _vector(owner: str, name: str, value: Any) -> Any:
-    return _tuple(owner, name, value, lambda item: _number(owner, name, item), 2)
+    return _tuple(owner, name, value, lambda item: number(owner, name, item), 2)
 
 
 class _Checked:
@@ -76,8 +61,8 @@ class Grid(_Checked):
 
     def __post_init__(self) -> None:
         self._set(
-            cells=_tuple("Grid", "cells", self.cells, lambda n: _count("Grid", "cells", n, 4), 2),
-            dx=_number("Grid", "dx", self.dx, above=0.0),
+            cells=_tuple("Grid", "cells", self.cells, lambda n: count("Grid", "cells", n, 4), 2),
+            dx=number("Grid", "dx", self.dx, above=0.0),
         )
 
     @property
@@ -109,8 +94,8 @@ class Material(_Checked):
 
     def __post_init__(self) -> None:
         for name in ("lame_mu", "density", "stiffness_floor", "mass_floor"):
-            self._set(**{name: _number("Material", name, getattr(self, name), above=0.0)})
-        self._set(lame_lambda=_number("Material", "lame_lambda", self.lame_lambda))
+            self._set(**{name: number("Material", name, getattr(self, name), above=0.0)})
+        self._set(lame_lambda=number("Material", "lame_lambda", self.lame_lambda))
         if self.lame_lambda < 0.0:
             raise SceneError(f"Material: lame_lambda = {self.lame_lambda!r} must not be negative")
         for name in ("stiffness_floor", "mass_floor"):
@@ -147,12 +132,6 @@ class Region(_Checked):
             raise SceneError(
                 f"{owner}: lower corner {self.lower} must be left of and below upper {self.upper}"
             )
-
-    def overlaps(self, other: Region) -> bool:
-        """Whether the two rectangles share an area."""
-        return all(
-            self.lower[k] < other.upper[k] and other.lower[k] < self.upper[k] for k in (0, 1)
-        )
 
 
 @dataclass(frozen=True)
@@ -195,7 +174,7 @@ class Actuator(Region):
                 f"Actuator: a second Piola-Kirchhoff stress is symmetric, but S_xy = "
                 f"{stress[0][1]!r} and S_yx = {stress[1][0]!r}"
             )
-        omega = _number("Actuator", "angular_frequency", self.angular_frequency, above=0.0)
+        omega = number("Actuator", "angular_frequency", self.angular_frequency, above=0.0)
         self._set(stress=stress, angular_frequency=omega)
 
 
@@ -228,9 +207,9 @@ class Wall(_Checked):
             raise SceneError(f'Wall: axis = {self.axis!r} must be "x" or "y"')
         if self.solid_side not in ("below", "above"):
             raise SceneError(f'Wall: solid_side = {self.solid_side!r} must be "below" or "above"')
-        self._set(position=_number("Wall", "position", self.position))
+        self._set(position=number("Wall", "position", self.position))
         if self.friction != "stick":
-            friction = _number("Wall", 'friction (or "stick")', self.friction)
+            friction = number("Wall", 'friction (or "stick")', self.friction)
             if friction < 0.0:
                 raise SceneError(f"Wall: friction = {friction!r} must not be negative")
             self._set(friction=friction)
@@ -254,7 +233,7 @@ class Mirror(_Checked):
     def __post_init__(self) -> None:
         if self.axis not in ("x", "y"):
             raise SceneError(f'Mirror: axis = {self.axis!r} must be "x" or "y"')
-        self._set(position=_number("Mirror", "position", self.position))
+        self._set(position=number("Mirror", "position", self.position))
 
     @property
     def normal(self) -> int:
@@ -322,18 +301,20 @@ class Scene(_Checked):
             value = getattr(self, name)
             if not isinstance(value, (tuple, list)) or not all(isinstance(v, part) for v in value):
                 raise SceneError(f"Scene: {name} must be a tuple of {part.__name__} objects")
+            if any(type(v) is Region for v in value):
+                raise SceneError("Scene: a Region must be a Design, a Solid or an Actuator")
             self._set(**{name: tuple(value)})
         self._set(
-            time_step=_number("Scene", "time_step", self.time_step, above=0.0),
-            steps=_count("Scene", "steps", self.steps, 1),
+            time_step=number("Scene", "time_step", self.time_step, above=0.0),
+            steps=count("Scene", "steps", self.steps, 1),
             gravity=_vector("Scene", "gravity", self.gravity),
             direction=_vector("Scene", "direction", self.direction),
-            particles_per_cell=_count("Scene", "particles_per_cell", self.particles_per_cell, 1),
+            particles_per_cell=count("Scene", "particles_per_cell", self.particles_per_cell, 1),
             filter_weights=_tuple(
                 "Scene",
                 "filter_weights",
                 self.filter_weights,
-                lambda w: _number("Scene", "filter_weights", w, above=0.0),
+                lambda w: number("Scene", "filter_weights", w, above=0.0),
                 3,
             ),
         )
@@ -379,7 +360,9 @@ class Scene(_Checked):
                         )
         for i, region in enumerate(self.body):
             for other in self.body[i + 1 :]:
-                if region.overlaps(other):
+                low, high = self.lattice(region)
+                other_low, other_high = self.lattice(other)
+                if all(low[k] < other_high[k] and other_low[k] < high[k] for k in (0, 1)):
                     raise SceneError(
                         f"Scene: {type(region).__name__} {region.lower} to {region.upper} overlaps "
                         f"{type(other).__name__} {other.lower} to {other.upper}"
@@ -389,10 +372,11 @@ class Scene(_Checked):
         slack = ROUNDING * self.grid.dx
         for wall in self.walls:
             k = "xy".index(wall.axis)
-            if not 0.0 <= wall.position <= self.grid.size[k]:
+            dx, size = self.grid.dx, self.grid.size[k]
+            if not dx - slack <= wall.position <= size - dx + slack:
                 raise SceneError(
-                    f"Scene: wall at {wall.axis} = {wall.position:g} is outside the grid, "
-                    f"which reaches from 0 to {self.grid.size[k]:g}"
+                    f"Scene: wall at {wall.axis} = {wall.position:g} must be within [{dx:g}, "
+                    f"{size - dx:g}], so that there are nodes behind it"
                 )
             for region in self.body:
                 depth = (
@@ -425,23 +409,19 @@ class Scene(_Checked):
         for what, vector in (("gravity", self.gravity), ("direction", self.direction)):
             if vector[k] != 0.0:
                 raise SceneError(f"{name}: {what} {vector} has a component across it, must have 0")
-        spacing = dx / self.particles_per_cell
-
-        def cells(lower: Vector, upper: Vector) -> tuple[int, ...]:
-            return tuple(round(edge / spacing) for edge in (*lower, *upper))
-
-        there = {(type(region), cells(region.lower, region.upper)) for region in self.body}
+        there = {(type(region), self.lattice(region)) for region in self.body}
         for region in self.body:
             low, high = mirror.image(region.lower), mirror.image(region.upper)
-            image = cells(
+            corners = (
                 (min(low[0], high[0]), min(low[1], high[1])),
                 (max(low[0], high[0]), max(low[1], high[1])),
             )
+            image = self.lattice(Region(*corners))
             where = f"{type(region).__name__} {region.lower} to {region.upper}"
             if (type(region), image) not in there:
                 raise SceneError(f"{name}: {where} has no mirror image in the body; add it")
             if isinstance(region, Actuator) and (
-                image != cells(region.lower, region.upper) or region.stress[0][1] != 0.0
+                image != self.lattice(region) or region.stress[0][1] != 0.0
             ):
                 raise SceneError(
                     f"{name}: {where} must be its own mirror image with S_xy = 0, has S_xy = "
@@ -482,6 +462,15 @@ class Scene(_Checked):
                     f"{LARGEST_SIGNAL:g}; keep it below lame_mu"
                 )
 
+    def lattice(self, region: Region) -> tuple[tuple[int, int], tuple[int, int]]:
+        """Lower and upper corner of a region in particle spacings."""
+        spacing = self.grid.dx / self.particles_per_cell
+        (x0, y0), (x1, y1) = region.lower, region.upper
+        return (round(x0 / spacing), round(y0 / spacing)), (
+            round(x1 / spacing),
+            round(y1 / spacing),
+        )
+
     @property
     def largest_time_step(self) -> float:
         """Stability limit dx sqrt(rho / (2 (mu + lambda))) of an isolated particle.
@@ -514,8 +503,16 @@ class Scene(_Checked):
         time_step: float | None = None,
         mass_floor: float | None = None,
         stiffness_floor: float | None = None,
+        coarsening: int = 1,
     ) -> Scene:
-        """The same scene and duration with another time step or other floors of the void.
+        """The same scene and duration with another time step, other floors, or wider cells.
+
+        Parameters
+        ----------
+        time_step, mass_floor, stiffness_floor : float, optional
+            As in `Scene` and `Material`.
+        coarsening : int, optional
+            How many of this scene's cells go into the width of a new one.
 
         Raises
         ------
@@ -528,14 +525,27 @@ class Scene(_Checked):
         if time_step is None:
             time_step = self.time_step
         else:
-            time_step = _number("Scene", "time_step", time_step, above=0.0)
+            time_step = number("Scene", "time_step", time_step, above=0.0)
+            if self.duration / time_step > MOST:
+                raise SceneError(
+                    f"Scene: time_step = {time_step:g} would take more than {MOST:.0e} steps"
+                )
             steps = max(1, round(self.duration / time_step))
             if abs(steps * time_step - self.duration) > 1e-9 * self.duration:
                 raise SceneError(
                     f"Scene: duration {self.duration:g} is no multiple of time_step = "
                     f"{time_step:g}; the nearest that divides it is {self.duration / steps:.10g}"
                 )
-        return dataclasses.replace(self, time_step=time_step, steps=steps, material=material)
+        coarsening = count("Scene", "coarsening", coarsening, 1)
+        if any(n % coarsening for n in self.grid.cells):
+            raise SceneError(
+                f"Scene: cells {self.grid.cells} are no multiples of coarsening = {coarsening}"
+            )
+        nx, ny = (n // coarsening for n in self.grid.cells)
+        grid = Grid((nx, ny), self.grid.dx * coarsening)
+        return dataclasses.replace(
+            self, grid=grid, time_step=time_step, steps=steps, material=material
+        )
 
     def to_json(self) -> str:
         """The scene as JSON text, from which `from_json` makes exactly the same scene."""
@@ -554,8 +564,12 @@ class Scene(_Checked):
             If the text is no JSON, keys are unknown or missing, or values do not fit.
         """
         try:
-            data = json.loads(text, parse_constant=_refuse_constant)
-        except (json.JSONDecodeError, UnicodeDecodeError, TypeError, RecursionError) as error:
+            data = json.loads(
+                text, parse_constant=_refuse_constant, object_pairs_hook=_refuse_duplicates
+            )
+        except SceneError:
+            raise
+        except (ValueError, TypeError, RecursionError) as error:
             raise SceneError(f"Scene: not JSON: {error}") from error
         data = dict(_object("Scene", data))
         for name, part in (("grid", Grid), ("material", Material), ("mirror", Mirror)):
@@ -578,6 +592,15 @@ class Scene(_Checked):
 
 def _refuse_constant(name: str) -> float:
     raise SceneError(f"Scene: {name} is not a number that a scene can hold")
+
+
+def _refuse_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    data = dict(pairs)
+    if len(data) < len(pairs):
+        names = [name for name, _ in pairs]
+        twice = sorted({name for name in names if names.count(name) > 1})
+        raise SceneError(f"Scene: keys {twice} are there twice; keep one of each")
+    return data
 
 
 def _object(owner: str, data: Any) -> dict[str, Any]:

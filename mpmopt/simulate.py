@@ -306,6 +306,7 @@ class Forward:
 
     def __init__(self, simulation: Simulation, checkpoints: Checkpoints, memory: _Segment) -> None:
         self._simulation, self._checkpoints, self._memory = simulation, checkpoints, memory
+        self._reversed = False
         first, last = checkpoints.schedule.segments[-1]
         self.state = memory.states[last - first].copy()
 
@@ -322,9 +323,14 @@ class Forward:
 
         Raises
         ------
+        DesignError
+            If called a second time: going back overwrites what it needs.
         StorageError
             If a checkpoint cannot be read back.
         """
+        if self._reversed:
+            raise DesignError("this run was gone back through already; run forward again")
+        self._reversed = True
         simulation, memory = self._simulation, self._memory
         schedule = self._checkpoints.schedule
         bar = seed.copy()

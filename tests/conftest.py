@@ -39,6 +39,11 @@ def small_scene(**changes) -> Scene:
     return Scene(**{**scene, **changes})
 
 
+def worst(test) -> float:
+    """The largest error of a `complex_step_test`."""
+    return max(result.error for result in test.values())
+
+
 @pytest.fixture
 def scene() -> Scene:
     return small_scene()

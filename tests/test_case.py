@@ -40,6 +40,7 @@ def test_a_small_walker_walks_even_without_its_void(folder):
     assert summary["optimised"] - summary["reference"] >= 0.05
     assert summary["post_processed"] - summary["reference"] >= 0.03
     assert summary["failed_evaluations"] == 0
+    assert summary["loose_particles"] >= 0
     assert summary["evaluations"] <= 30
 
 
@@ -72,7 +73,7 @@ def test_an_earlier_run_is_never_overwritten(folder):
 
 def test_a_folder_that_cannot_be_made_is_a_storage_error(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(StorageError, match="cannot make"):
+    with pytest.raises(StorageError, match="cannot write to"):
         run(SMALL, tmp_path / "file" / "folder")
 
 
@@ -93,6 +94,15 @@ def test_the_command_prints_the_summary_or_an_error(tmp_path, capsys):
     assert capsys.readouterr().err.startswith("StorageError: ")
 
 
+def test_an_interrupt_says_where_the_run_is(tmp_path, capsys, monkeypatch):
+    def interrupted(self, x):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Problem, "value_and_gradient", interrupted)
+    assert main("A case.", {"default": SMALL}, ["--out", str(tmp_path)]) == 130
+    assert "run.h5 holds the run so far" in capsys.readouterr().err
+
+
 def test_progress_becomes_log_lines_off_a_terminal(capsys):
     settings = Settings(SMALL.settings.stages[:1], window=1, most_iterations=20, tolerance=0.0)
     scene = dataclasses.replace(SMALL.scene, steps=10)
@@ -107,7 +117,8 @@ def test_the_walkers_settings_are_those_of_the_design():
     preview, default, paper = (CASES[name] for name in ("preview", "default", "paper"))
     assert (preview.scene.grid.cells[0], preview.scene.time_step) == (64, 8e-4)
     assert (default.scene.grid.cells[0], default.scene.time_step) == (128, 5e-4)
-    assert {(s.mass_floor, s.stiffness_floor) for s in default.settings.stages} == {(1e-2, 1e-3)}
+    fine = [s for s in default.settings.stages if s.coarsening == 1]
+    assert {(s.mass_floor, s.stiffness_floor, s.time_step) for s in fine} == {(1e-2, 1e-3, 5e-4)}
     assert (paper.scene.grid.cells[0], paper.scene.steps) == (128, 5000)
     assert {(s.mass_floor, s.stiffness_floor) for s in paper.settings.stages} == {(1e-3, 1e-3)}
     assert [s.beta for s in paper.settings.stages] == [0.5, 1.0, 2.0, 4.0, 8.0, 16.0]
@@ -143,3 +154,28 @@ def test_a_second_start_takes_its_kernels_from_the_cache(tmp_path):
     )
     start_up(tmp_path, program)
     assert start_up(tmp_path, program) == ["1", "0", "1"]
+
+
+def test_the_example_in_the_readme_goes_farther(capsys):
+    text = (ROOT / "README.md").read_text()
+    example = text.split("```python\n")[1].split("```")[0]
+    exec(compile(example, "README.md", "exec"), {})
+    before, after = (float(part) for part in capsys.readouterr().out.split(" -> "))
+    assert after >= before + 0.05
+
+
+PAPER = """
+import resource
+from walker import CASES
+from mpmopt.problem import Problem
+stage = CASES["paper"].settings.stages[0]
+problem = Problem(stage.scene(CASES["paper"].scene), stage.beta)
+problem.value_and_gradient(problem.join(0.1, 1.0, -0.3, -0.5))
+print(problem.scene.steps, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1000)
+"""
+
+
+def test_a_gradient_of_the_papers_size_needs_less_than_half_a_gigabyte(tmp_path):
+    steps, megabytes = start_up(tmp_path, PAPER)
+    assert int(steps) == 5000
+    assert int(megabytes) <= 500

@@ -62,7 +62,19 @@ def test_every_kth_state_recomputes_all_but_the_last_segment():
     assert schedule.steps_recomputed == 90
 
 
-@pytest.mark.parametrize("wrong", [{"every": 0}, {"every": "some"}, {"memory": 0}, {"store": 3}])
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"every": 0},
+        {"every": "some"},
+        {"every": True},
+        {"every": 2.5},
+        {"memory": 0},
+        {"memory": "256MB"},
+        {"memory": None},
+        {"store": 3},
+    ],
+)
 def test_senseless_wishes_are_refused(wrong):
     with pytest.raises(DesignError, match=next(iter(wrong))):
         Checkpointing(**wrong)
@@ -139,7 +151,7 @@ def test_too_little_room_on_the_disk_is_said_before_any_step(tmp_path):
     free = shutil.disk_usage(tmp_path).free
     schedule = Schedule(10, 1, False, False, 1)
     path = tmp_path / "states.h5"
-    with pytest.raises(StorageError, match=r"MB needed, [\d.]+ MB free; store fewer states"):
+    with pytest.raises(StorageError, match=r"MB needed, \S+ MB free; store fewer states"):
         Checkpoints(schedule, {"state": ((free // 8,), float)}, path)
     assert list(tmp_path.iterdir()) == []
 
@@ -164,6 +176,56 @@ def test_a_file_that_can_grow_no_more_is_a_storage_error(tmp_path):
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limit)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_foreign_file_is_never_replaced_or_removed(tmp_path):
+    precious = tmp_path / "precious.h5"
+    precious.write_text("mine")
+    schedule = Schedule(10, 1, False, False, 100)
+    with pytest.raises(StorageError, match="exists and holds no checkpoints"):
+        Checkpoints(schedule, ONE_NUMBER, precious)
+    assert precious.read_text() == "mine"
+    with pytest.raises(StorageError, match="exists and holds no checkpoints"):
+        Checkpoints(schedule, ONE_NUMBER, tmp_path)
+
+
+def test_a_kept_store_is_replaced_only_by_a_complete_one(rough_walker, tmp_path, monkeypatch):
+    scene, x, _ = rough_walker
+    kept = tmp_path / "states.h5"
+    problem = Problem(scene, 2.0, Checkpointing(every=50, store=kept))
+    problem.value_and_gradient(x)
+    before = kept.read_bytes()
+    monkeypatch.setattr("mpmopt.simulate.Forward.reverse", lambda *_: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        problem.value_and_gradient(0.5 * x)
+    assert kept.read_bytes() == before
+    monkeypatch.undo()
+    problem.value_and_gradient(0.5 * x)
+    assert kept.read_bytes() != before
+    assert [path.name for path in tmp_path.iterdir()] == ["states.h5"]
+
+
+def test_stores_do_not_know_each_other(rough_walker):
+    scene, x, _ = rough_walker
+    simulation = Problem(scene, 2.0).simulation(x)
+    wish = Checkpointing(every=100, store="memory")
+    with simulation.checkpoints(wish) as one, simulation.checkpoints(wish) as other:
+        one.write(0, state=simulation.initial)
+        other.write(0, state=2.0 * simulation.initial)
+        assert np.array_equal(one.read(0, "state"), simulation.initial)
+
+
+@pytest.mark.parametrize("every", [50, "all", 250])
+def test_going_back_twice_is_refused(rough_walker, every):
+    scene, x, _ = rough_walker
+    problem = Problem(scene, 2.0)
+    simulation = problem.simulation(x)
+    with simulation.checkpoints(Checkpointing(every)) as checkpoints:
+        forward = simulation.forward(checkpoints)
+        seed = problem.objective.seed(forward.state)
+        forward.reverse(seed)
+        with pytest.raises(DesignError, match="run forward again"):
+            forward.reverse(seed)
 
 
 def test_a_store_that_lost_its_data_says_so(tmp_path):

@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 from conftest import small_scene
+from walker import walker
 
 from mpmopt.errors import DesignError, SceneError, SimulationError
 from mpmopt.optimize import Settings, Stage, optimise
@@ -77,6 +78,20 @@ def test_each_stage_starts_from_the_last_ones_best(scene, start):
     assert np.array_equal(second.x, last_of_first.x)
 
 
+def test_a_coarse_stage_hands_its_best_design_to_the_finer_grid():
+    scene = walker(128, 4e-4)
+    scene = dataclasses.replace(scene, steps=100)
+    stages = (Stage(0.5, 1e-2, 1e-3, 8e-4, coarsening=2), Stage(1.0, 1e-2, 1e-3, 4e-4))
+    settings = Settings(stages, window=1, least_iterations=3, most_iterations=3)
+    coarse = Problem(stages[0].scene(scene))
+    run = optimise(scene, settings, coarse.join(0.0, 1.0, -0.3, -0.5))
+    first, second = (next(item for item in run.history if item.stage == stage) for stage in (0, 1))
+    assert 4 * (first.x.size - 3) == second.x.size - 3
+    handed = Problem(scene).transfer(coarse, run.best[0].x)
+    assert np.array_equal(second.x, handed)
+    assert second.step == 0.0
+
+
 def test_the_moving_average_ends_a_stage(scene, start):
     still = Settings(STAGES[:1], tolerance=1.0, least_iterations=13, most_iterations=100)
     run = optimise(scene, still, start)
@@ -128,7 +143,7 @@ def test_failure_from_the_start_is_an_error_that_can_be_read(scene, start, monke
     fail_on(monkeypatch, set(range(1000)))
     run = optimise(scene, dataclasses.replace(QUICK, most_failures=3), start)
     assert "gave up after 3" in run.stop_reason
-    with pytest.raises(SimulationError, match="every evaluation failed"):
+    with pytest.raises(DesignError, match=r"no evaluation succeeded; the last: .*made to fail"):
         _ = run.result
 
 
@@ -157,10 +172,38 @@ def test_a_start_that_does_not_fit_is_refused(scene):
         optimise(scene, QUICK, np.zeros(3))
 
 
+def test_a_stage_that_never_runs_gives_up_after_three_halvings(scene, start, monkeypatch):
+    calls = fail_on(monkeypatch, set(range(1000)))
+    run = optimise(scene, QUICK, start)
+    assert [step for step, _ in calls] == [4e-3, 2e-3, 1e-3, 5e-4]
+    assert "gave up after 4 failed" in run.stop_reason
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"beta": -1.0},
+        {"beta": "a"},
+        {"mass_floor": None},
+        {"time_step": 0.0},
+        {"stiffness_floor": np.nan},
+        {"coarsening": 0},
+        {"coarsening": 1.5},
+    ],
+)
+def test_senseless_stages_are_refused(wrong):
+    with pytest.raises(DesignError, match=next(iter(wrong))):
+        dataclasses.replace(STAGES[0], **wrong)
+
+
 @pytest.mark.parametrize(
     "wrong",
     [
         {"stages": ()},
+        {"stages": (1,)},
+        {"window": 2.5},
+        {"most_iterations": np.inf},
+        {"move_limit": "a"},
         {"window": 0},
         {"least_iterations": 300},
         {"move_limit": 0.0},

@@ -4,13 +4,13 @@ import dataclasses
 
 import numpy as np
 import pytest
-from conftest import small_scene
+from conftest import small_scene, worst
 from walker import walker
 
-from mpmopt.binary import distance, full_block, post_processed
+from mpmopt.binary import distance, full_block, loose, post_processed
 from mpmopt.errors import DesignError, SimulationError
 from mpmopt.problem import Problem
-from mpmopt.verify import COMPLEX_STEP, COMPLEX_TOLERANCE, complex_step_errors
+from mpmopt.verify import COMPLEX_STEP, COMPLEX_TOLERANCE, complex_step_test
 
 
 @pytest.fixture
@@ -26,12 +26,12 @@ def x(problem, rng):
 def test_gradient_of_the_preview_walker_over_all_its_steps(rng):
     problem = Problem(walker(64, 8e-4).vary(mass_floor=1e-2, stiffness_floor=1e-3), beta=2.0)
     x = problem.join(rng.uniform(-1.0, 1.0, problem.size - 3), 0.9, -0.3, -0.5)
-    errors = complex_step_errors(problem, x)
+    errors = complex_step_test(problem, x)
     assert set(errors) == {
         "phi along direction 0", "phi along direction 1",
         "a of actuator 0", "theta of actuator 0", "b of actuator 0",
     }  # fmt: skip
-    assert max(errors.values()) <= COMPLEX_TOLERANCE
+    assert worst(errors) <= COMPLEX_TOLERANCE
     # The complex run's real part is the run itself.
     value, _ = problem.value_and_gradient(x)
     assert problem.value(x + 1j * COMPLEX_STEP).real == pytest.approx(value, rel=1e-14)
@@ -40,14 +40,14 @@ def test_gradient_of_the_preview_walker_over_all_its_steps(rng):
 @pytest.mark.parametrize("beta", [0.5, 8.0])
 def test_gradient_with_friction_two_walls_and_two_actuators(problem, x, beta):
     problem = Problem(problem.scene, beta)
-    assert max(complex_step_errors(problem, x, directions=3).values()) <= COMPLEX_TOLERANCE
+    assert worst(complex_step_test(problem, x, directions=3)) <= COMPLEX_TOLERANCE
 
 
 def test_gradient_in_a_slanted_direction_and_three_particles_a_cell():
     scene = small_scene(direction=(0.6, -0.8), particles_per_cell=3)
     problem = Problem(scene)
     x = problem.join(0.1, [0.9, 0.5], [-0.3, 0.2], [-0.5, 0.1])
-    assert max(complex_step_errors(problem, x).values()) <= COMPLEX_TOLERANCE
+    assert worst(complex_step_test(problem, x)) <= COMPLEX_TOLERANCE
 
 
 def test_value_is_that_of_value_and_gradient(problem, x):
@@ -80,7 +80,7 @@ def test_a_scene_without_actuators_still_has_a_gradient():
     problem = Problem(scene, beta=1.0)
     x = problem.join(np.linspace(-0.5, 0.5, 32), 0.0, 0.0, 0.0)
     assert problem.size == 32
-    assert max(complex_step_errors(problem, x).values()) <= COMPLEX_TOLERANCE
+    assert worst(complex_step_test(problem, x)) <= COMPLEX_TOLERANCE
 
 
 @pytest.mark.parametrize(
@@ -98,6 +98,39 @@ def test_designs_that_do_not_fit_are_refused(problem, x, change, says):
             function(change(x))
 
 
+def test_whole_and_single_precision_numbers_are_designs_too(problem):
+    x = problem.join(0.0, 1.0, 0.0, -1.0)
+    expected = problem.value_and_gradient(x)
+    for other in (x.astype(int), x.astype(np.float32), list(x)):
+        assert problem.value(other) == expected[0]
+        assert np.array_equal(problem.value_and_gradient(other)[1], expected[1])
+    assert np.array_equal(problem.join(0, 1, 0, -1), x)
+
+
+@pytest.mark.parametrize("value", ["a", 1j, None, np.zeros(3), np.zeros((32, 1))])
+def test_variables_that_are_no_real_numbers_of_the_right_shape_are_refused(problem, value):
+    with pytest.raises(DesignError, match="phi"):
+        problem.join(value, 0.0, 0.0, 0.0)
+
+
+def test_a_gradient_at_a_complex_design_is_refused(problem, x):
+    with pytest.raises(DesignError, match="complex128, must hold real"):
+        problem.value_and_gradient(x + 0j)
+    with pytest.raises(DesignError, match="must hold real"):
+        problem.value(np.array(["a"] * x.size))
+
+
+def test_loose_particles_hang_on_nothing(problem):
+    gamma = np.zeros(32, dtype=bool)
+    position = problem.particles.position[problem.particles.designed] * 32  # in spacings
+    column = (position[:, 0] > 6) & (position[:, 0] < 7)
+    assert not loose(problem.scene, column).any()  # reaches up to the actuator
+    low = position[:, 1] < 9
+    assert loose(problem.scene, low).sum() == low.sum() == 8  # the lowest row alone
+    assert not loose(problem.scene, gamma).any()
+    assert not loose(problem.scene, low | column).any()
+
+
 def test_a_result_that_is_not_finite_never_leaves(problem, x, monkeypatch):
     monkeypatch.setattr("mpmopt.objective.Objective.value", lambda *_: np.nan)
     with pytest.raises(SimulationError, match="1 of 1 results are not finite"):
@@ -111,7 +144,21 @@ def test_a_black_design_without_its_void_is_the_solid_body(problem):
     assert problem.value(black) == pytest.approx(value, rel=1e-13)
     assert post_processed(problem, black) == pytest.approx(value, rel=1e-13)
     still = problem.join(0.0, 0.0, 0.0, 0.0)
-    assert full_block(problem, still, black) >= value
+    actuations = [problem.split(design) for design in (still, black)]
+    assert full_block(problem.scene, *actuations) >= value
+
+
+def test_a_design_is_transferred_to_another_grid_as_it_looks():
+    coarse = Problem(walker(64, 8e-4))
+    fine = Problem(walker(128, 4e-4))
+    centre = coarse.particles.position[coarse.particles.designed] - [13 / 64, 7.5 / 64]
+    phi = np.where(np.hypot(*centre.T) < 4 / 64, 1.0, -1.0)
+    x = fine.transfer(coarse, coarse.join(phi, 0.9, -0.3, -0.5))
+    parts = fine.split(x)
+    assert (parts.a, parts.theta, parts.b) == (0.9, -0.3, -0.5)
+    assert parts.phi.size == 4 * phi.size
+    assert parts.phi.mean() == pytest.approx(phi.mean(), abs=1e-14)
+    assert np.array_equal(coarse.split(coarse.transfer(fine, x)).phi, phi)
 
 
 def test_removing_void_keeps_what_is_above_the_threshold(problem):

@@ -4,11 +4,13 @@ import dataclasses
 import json
 import math
 
+import numpy as np
 import pytest
 from conftest import small_scene
 from walker import CASES, walker
 
 from mpmopt.errors import SceneError
+from mpmopt.particles import lay_out
 from mpmopt.scene import Actuator, Design, Grid, Material, Region, Scene, Solid, Wall
 
 
@@ -96,11 +98,14 @@ C = 1 / 16
             ["overlaps"],
         ),
         (lambda: small_scene(walls=(Wall("y", 5 * C),)), ["0.0625 into the wall", "0.3125"]),
-        (lambda: small_scene(walls=(Wall("y", 1.5),)), ["1.5", "outside the grid"]),
+        (lambda: small_scene(walls=(Wall("y", 1.5),)), ["1.5", "within [0.0625, 0.9375]"]),
+        (lambda: small_scene(walls=(Wall("y", 0.0),)), ["y = 0 ", "nodes behind it"]),
+        (lambda: small_scene(steps=10**30), ["from 1 to 1e+08"]),
+        (lambda: small_scene().vary(time_step=1e-320), ["more than 1e+08 steps"]),
         (lambda: small_scene(time_step=0.1), ["0.1", "0.00988", "stability"]),
         (lambda: small_scene(material=Material(mass_floor=1e-4)), ["0.004", "0.0031"]),
         (lambda: small_scene(material=Material(lame_mu=4.0)), ["lame_mu = 4", "-4"]),
-        (lambda: small_scene(particles_per_cell=0), ["0", ">= 1"]),
+        (lambda: small_scene(particles_per_cell=0), ["0", "from 1 to"]),
         (lambda: small_scene(grid=16), ["Grid"]),
         (lambda: small_scene(body=(1,)), ["Region"]),
     ],
@@ -132,12 +137,47 @@ def test_another_time_step_keeps_the_duration(scene):
         scene.vary(time_step=3e-3)
 
 
+def test_a_coarser_scene_is_the_same_body():
+    assert walker(128, 8e-4).vary(coarsening=2) == walker(64, 8e-4)
+    with pytest.raises(SceneError, match=r"\(128, 128\) are no multiples of coarsening = 3"):
+        walker(128, 4e-4).vary(coarsening=3)
+
+
 def test_a_scene_cannot_be_changed(scene):
     with pytest.raises(dataclasses.FrozenInstanceError):
         scene.steps = 1
 
 
-def test_regions_that_share_an_edge_do_not_overlap():
-    left, right = Region((0.0, 0.0), (1.0, 1.0)), Region((1.0, 0.0), (2.0, 1.0))
-    assert not left.overlaps(right)
-    assert left.overlaps(Region((0.5, 0.5), (0.6, 0.6)))
+def test_edges_that_touch_but_for_rounding_do_not_overlap():
+    grid = Grid((20, 20), 0.05)
+    left, right = Design((0.1, 0.1), (3 * 0.1, 0.5)), Solid((0.3, 0.1), (0.5, 0.5))
+    assert left.upper[0] > right.lower[0]
+    scene = Scene(grid, time_step=1e-3, steps=1, body=(left, right))
+    assert len(lay_out(scene).position) == 4 * 4 * 8 * 2
+
+
+def test_a_region_that_is_neither_design_nor_solid_nor_actuator_is_refused():
+    with pytest.raises(SceneError, match="a Region must be"):
+        small_scene(body=(Solid((3 * C, 4 * C), (4 * C, 5 * C)), Region((0.5, 0.5), (0.6, 0.6))))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        '{"steps": 1, "steps": 2}',
+        '{"steps": 1' + 400 * "0" + "}",
+        '{"steps": 1' + 5000 * "0" + "}",
+        '{"grid": {"cells": [16, 16], "dx": 1'
+        + 400 * "0"
+        + '}, "time_step": 1, "steps": 1, "body": []}',
+    ],
+)
+def test_numbers_and_keys_that_json_allows_but_a_scene_does_not(text):
+    with pytest.raises(SceneError):
+        Scene.from_json(text)
+
+
+@pytest.mark.parametrize("value", [np.complex128(1 + 2j), True, "1", None, [1.0]])
+def test_only_real_numbers_are_numbers(value):
+    with pytest.raises(SceneError, match="must be a number"):
+        Material(density=value)

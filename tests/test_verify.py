@@ -1,5 +1,6 @@
 """The checks pass what is right, and fail what is wrong."""
 
+import dataclasses
 import json
 import os
 import subprocess
@@ -9,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import small_scene
+from walker import walker
 
 from mpmopt.problem import Problem
 from mpmopt.verify import contact_free, dot_product_mismatch, report, taylor_test
@@ -24,6 +26,23 @@ def test_a_report_passes_on_a_rough_scene(rng):
     assert {check.name.split(":")[0] for check in checks} == {
         "dot product", "complex step", "Taylor order, contact-free",
     }  # fmt: skip
+    assert [check for check in checks if not check.passed] == []
+
+
+@pytest.mark.parametrize("parts", [slice(1, None), slice(0, 3, 2)])
+def test_a_report_passes_without_design_or_without_actuators(parts):
+    scene = small_scene()
+    problem = Problem(dataclasses.replace(scene, body=scene.body[parts]))
+    checks = report(problem, problem.join(0.2, 0.9, -0.3, -0.5))
+    assert [check for check in checks if not check.passed] == []
+
+
+def test_a_report_on_a_sharp_stiff_design_knows_what_rounding_does(rng):
+    # All steps of the preview's walker, nearly black and white, at beta = 32.
+    problem = Problem(walker(64, 8e-4).vary(mass_floor=1e-2), beta=32.0)
+    blocks = problem.particles.position[problem.particles.designed] * 64
+    phi = np.where((blocks // 3).astype(int).sum(axis=1) % 2 == 0, 0.2, -0.2)
+    checks = report(problem, problem.join(phi, 1.0, -0.7, -1.0))
     assert [check for check in checks if not check.passed] == []
 
 
