@@ -8,8 +8,7 @@ design can be compared, but not distances.
 
 import sys
 
-from mpmopt.case import MOST_ITERATIONS, Case, main, refining, sharpening
-from mpmopt.optimize import Settings, Stage
+from mpmopt.case import Case, main, published, refined, sharpened
 from mpmopt.scene import Actuator, Design, Grid, Mirror, Scene, Wall
 
 
@@ -36,21 +35,9 @@ def crawler(cells: int, time_step: float, mirror: bool = True) -> Scene:
 
 
 CASES = {
-    "default": Case(
-        crawler(128, 5e-4), Settings(refining(8e-4, 5e-4), most_iterations=MOST_ITERATIONS)
-    ),
-    "preview": Case(crawler(64, 8e-4), Settings(sharpening(8e-4), most_iterations=MOST_ITERATIONS)),
-    # Moving asymptotes as published, going on from the last design as beta doubles.
-    "paper": Case(
-        crawler(128, 2e-4),
-        Settings(
-            tuple(Stage(0.5 * 2**k, 1e-3, 1e-3, 2e-4) for k in range(6)),
-            move_limit=0.5,
-            adapt_move_limit=False,
-            sharpen_asymptotes=False,
-            best_first=False,
-        ),
-    ),
+    "default": Case(crawler(128, 5e-4), refined(8e-4, 5e-4)),
+    "preview": Case(crawler(64, 8e-4), sharpened(8e-4)),
+    "paper": Case(crawler(128, 2e-4), published(2e-4)),
 }
 
 if __name__ == "__main__":

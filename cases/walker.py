@@ -8,8 +8,7 @@ design can be compared, but not distances.
 
 import sys
 
-from mpmopt.case import MOST_ITERATIONS, Case, main, refining, sharpening
-from mpmopt.optimize import Settings, Stage
+from mpmopt.case import Case, main, published, refined, sharpened
 from mpmopt.scene import Actuator, Design, Grid, Scene, Solid, Wall
 
 
@@ -32,21 +31,9 @@ def walker(cells: int, time_step: float) -> Scene:
 
 
 CASES = {
-    "default": Case(
-        walker(128, 5e-4), Settings(refining(8e-4, 5e-4), most_iterations=MOST_ITERATIONS)
-    ),
-    "preview": Case(walker(64, 8e-4), Settings(sharpening(8e-4), most_iterations=MOST_ITERATIONS)),
-    # Moving asymptotes as published, going on from the last design as beta doubles.
-    "paper": Case(
-        walker(128, 2e-4),
-        Settings(
-            tuple(Stage(0.5 * 2**k, 1e-3, 1e-3, 2e-4) for k in range(6)),
-            move_limit=0.5,
-            adapt_move_limit=False,
-            sharpen_asymptotes=False,
-            best_first=False,
-        ),
-    ),
+    "default": Case(walker(128, 5e-4), refined(8e-4, 5e-4)),
+    "preview": Case(walker(64, 8e-4), sharpened(8e-4)),
+    "paper": Case(walker(128, 2e-4), published(2e-4)),
 }
 
 if __name__ == "__main__":

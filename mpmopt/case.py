@@ -23,7 +23,6 @@ from mpmopt.optimize import Optimisation, Settings, Stage, optimise
 from mpmopt.problem import Problem, Variables
 from mpmopt.scene import Scene
 
-MOST_ITERATIONS = 25  # of a stage: more of them only polish what the next stage changes
 START = {"phi": 0.0, "a": 1.0, "theta": -0.3, "b": -0.5}
 
 
@@ -41,11 +40,10 @@ class Case:
     settings: Settings
 
 
-def sharpening(time_step: float, stages: int = 7, coarsening: int = 1) -> tuple[Stage, ...]:
-    """Stages of a coarse grid: void loses weight as it becomes distinct.
+def _sharpening(time_step: float, stages: int, coarsening: int = 1) -> tuple[Stage, ...]:
+    """Beta doubled from 0.5, the mass floor halved with it; the sixth and later judged solid.
 
-    Beta is doubled from 0.5 and the mass floor halved from 1e-2; from the fourth stage on the void
-    is so light that it needs half the time step. The sixth and later ones are judged without void.
+    From the fourth stage on the void is so light that it needs half the time step.
     """
     return tuple(
         Stage(
@@ -60,10 +58,33 @@ def sharpening(time_step: float, stages: int = 7, coarsening: int = 1) -> tuple[
     )
 
 
-def refining(coarse_time_step: float, time_step: float) -> tuple[Stage, ...]:
-    """Find the gait on cells twice as wide, then the shape: beta 8, 16 and 32 on the scene's own."""
-    fine = (Stage(beta, 1e-2, 1e-3, time_step, solid=True) for beta in (8.0, 16.0, 32.0))
-    return (*sharpening(coarse_time_step, stages=5, coarsening=2), *fine)
+def sharpened(time_step: float) -> Settings:
+    """Void loses weight as it becomes distinct: beta from 0.5 to 32, the mass floor from 1e-2."""
+    return Settings(_sharpening(time_step, stages=7), most_iterations=25)
+
+
+def refined(coarse_time_step: float, time_step: float) -> Settings:
+    """Cells twice as wide find the gait, up to beta = 8; the scene's own find the shape.
+
+    The fine stages have beta = 8, 16 and 32, a mass floor of 1e-2, and are judged without void.
+    """
+    coarse = _sharpening(coarse_time_step, stages=5, coarsening=2)
+    fine = tuple(Stage(beta, 1e-2, 1e-3, time_step, solid=True) for beta in (8.0, 16.0, 32.0))
+    return Settings((*coarse, *fine), most_iterations=25)
+
+
+def published(time_step: float) -> Settings:
+    """The paper's: beta doubled from 0.5 to 16, both floors 1e-3, moving asymptotes as published.
+
+    Each stage goes on from the last design of the one before.
+    """
+    return Settings(
+        tuple(Stage(0.5 * 2**k, 1e-3, 1e-3, time_step) for k in range(6)),
+        move_limit=0.5,
+        adapt_move_limit=False,
+        sharpen_asymptotes=False,
+        best_first=False,
+    )
 
 
 class ProgressBar:
