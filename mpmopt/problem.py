@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from mpmopt.actuation import signal, signal_adjoint
 from mpmopt.checkpoints import Checkpointing
@@ -115,7 +115,7 @@ class Problem:
         """
         positions = [p.particles.position[p.particles.designed] for p in (other, self)]
         parts = other.split(x)
-        phi = parts.phi[cKDTree(positions[0]).query(positions[1])[1]] if self._designed else 0.0
+        phi = parts.phi[KDTree(positions[0]).query(positions[1])[1]] if self._designed else 0.0
         return self.join(phi, parts.a, parts.theta, parts.b)
 
     def gamma(self, x: NDArray) -> NDArray:
