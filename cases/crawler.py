@@ -8,6 +8,8 @@ design can be compared, but not distances.
 
 import sys
 
+import numpy as np
+
 from mpmopt.case import Case, main, published, refined, sharpened
 from mpmopt.scene import Actuator, Design, Grid, Mirror, Scene, Wall
 
@@ -34,10 +36,20 @@ def crawler(cells: int, time_step: float, mirror: bool = True) -> Scene:
     )
 
 
+def slanted_legs(positions: np.ndarray) -> np.ndarray:
+    """What one would draw by hand: a spine with three pairs of legs that lean back."""
+    c = 1 / 64
+    x, y = positions.T
+    height = abs(y - 32 * c)
+    foot = 4 * c * height / (6 * c)  # how far back a leg has leant at this height
+    legs = [abs(x + foot - top * c) <= 1.25 * c for top in (15, 23, 31)]
+    return np.any([*legs, height <= 1.5 * c], axis=0)
+
+
 CASES = {
-    "default": Case(crawler(128, 5e-4), refined(8e-4, 5e-4)),
-    "preview": Case(crawler(64, 8e-4), sharpened(8e-4)),
-    "paper": Case(crawler(128, 2e-4), published(2e-4)),
+    "default": Case(crawler(128, 5e-4), refined(8e-4, 5e-4), slanted_legs),
+    "preview": Case(crawler(64, 8e-4), sharpened(8e-4), slanted_legs),
+    "paper": Case(crawler(128, 2e-4), published(2e-4), slanted_legs),
 }
 
 if __name__ == "__main__":

@@ -8,6 +8,8 @@ design can be compared, but not distances.
 
 import sys
 
+import numpy as np
+
 from mpmopt.case import Case, main, published, refined, sharpened
 from mpmopt.scene import Actuator, Design, Grid, Scene, Solid, Wall
 
@@ -30,10 +32,18 @@ def walker(cells: int, time_step: float) -> Scene:
     )
 
 
+def slanted_legs(positions: np.ndarray) -> np.ndarray:
+    """What one would draw by hand: three legs that lean back, as a bristle robot's."""
+    c = 1 / 64
+    x, y = positions.T
+    foot = 2.5 * c * (11 * c - y) / (7 * c)  # how far back a leg has leant at this height
+    return np.any([abs(x + foot - top * c) <= 1.25 * c for top in (7, 13, 19)], axis=0)
+
+
 CASES = {
-    "default": Case(walker(128, 5e-4), refined(8e-4, 5e-4)),
-    "preview": Case(walker(64, 8e-4), sharpened(8e-4)),
-    "paper": Case(walker(128, 2e-4), published(2e-4)),
+    "default": Case(walker(128, 5e-4), refined(8e-4, 5e-4), slanted_legs),
+    "preview": Case(walker(64, 8e-4), sharpened(8e-4), slanted_legs),
+    "paper": Case(walker(128, 2e-4), published(2e-4), slanted_legs),
 }
 
 if __name__ == "__main__":

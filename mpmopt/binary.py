@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import label
 
 from mpmopt.actuation import signal
-from mpmopt.errors import DesignError
+from mpmopt.errors import DesignError, SimulationError
 from mpmopt.objective import Objective
 from mpmopt.particles import lay_out
 from mpmopt.problem import Problem, Variables
@@ -15,6 +17,8 @@ from mpmopt.scene import Scene
 from mpmopt.simulate import Simulation
 
 THRESHOLD = 0.3  # of gamma, as in the paper
+
+Drawing = Callable[[NDArray[np.float64]], NDArray[np.bool_]]
 
 
 def solid_body(
@@ -97,10 +101,34 @@ def loose(scene: Scene, keep: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return (there & ~held)[particles.designed]
 
 
-def full_block(scene: Scene, *actuations: Variables) -> float:
-    """Objective L of the reference: the design domain all solid, with the best of some actuations.
+def full_block(positions: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """A drawing in which all design particles are there: the simplest reference design."""
+    return np.ones(len(positions), dtype=bool)
 
-    The simplest body that one would draw.
+
+def farthest(scene: Scene, drawing: Drawing, *actuations: Variables) -> float:
+    """Objective L of a drawn design with the best of some actuations, of those that run.
+
+    Parameters
+    ----------
+    scene : Scene
+    drawing : callable
+        From the design particles' reference positions (D, 2) to which of them are there (D,).
+    actuations : Variables
+
+    Raises
+    ------
+    SimulationError
+        If none runs.
     """
-    keep = np.ones(int(lay_out(scene).designed.sum()), dtype=bool)
-    return max(distance(scene, keep, actuation) for actuation in actuations)
+    particles = lay_out(scene)
+    keep = drawing(particles.position[particles.designed])
+    values, failure = [], None
+    for actuation in actuations:
+        try:
+            values.append(distance(scene, keep, actuation))
+        except SimulationError as error:
+            failure = error
+    if failure is not None and not values:
+        raise failure
+    return max(values)

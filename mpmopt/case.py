@@ -16,7 +16,7 @@ import numpy as np
 from tqdm import tqdm
 
 from mpmopt import runfile
-from mpmopt.binary import THRESHOLD, full_block, loose, post_processed
+from mpmopt.binary import THRESHOLD, Drawing, farthest, full_block, loose, post_processed
 from mpmopt.checkpoints import Checkpointing
 from mpmopt.errors import MpmoptError, SimulationError, StorageError
 from mpmopt.optimize import Optimisation, Settings, Stage, optimise
@@ -28,16 +28,20 @@ START = {"phi": 0.0, "a": 1.0, "theta": -0.3, "b": -0.5}
 
 @dataclass(frozen=True)
 class Case:
-    """A scene and how to optimise it.
+    """A scene, how to optimise it, and what an engineer would draw instead.
 
     Attributes
     ----------
     scene : Scene
     settings : Settings
+    drawing : callable
+        From positions (D, 2) of the design particles to which are there (D,): a second reference
+        design besides the full block.
     """
 
     scene: Scene
     settings: Settings
+    drawing: Drawing
 
 
 def _sharpening(time_step: float, stages: int, coarsening: int = 1) -> tuple[Stage, ...]:
@@ -141,15 +145,18 @@ def run(case: Case, out: Path, checkpointing: Checkpointing | None = None) -> di
         [lambda current: runfile.write(path, current), ProgressBar()],
         checkpointing,
     )
-    summary = summarise(result)
+    summary = summarise(result, case.drawing)
     text = json.dumps(summary, indent=1) + "\n"
     runfile.replace_file(out / "summary.json", text.encode())
     _draw(out, result, summary)
     return summary
 
 
-def summarise(result: Optimisation) -> dict[str, Any]:
-    """Objective values (L, larger is farther), actuation and counts of a finished optimisation."""
+def summarise(result: Optimisation, drawing: Drawing) -> dict[str, Any]:
+    """Objective values (L, larger is farther), actuation and counts of a finished optimisation.
+
+    Reference designs count with the better of the first and the best design's actuation.
+    """
     best, problem = result.result, result.problem()
     half = Problem(problem.scene.vary(time_step=best.time_step / 2.0), best.beta)
     first = result.history[0]
@@ -161,7 +168,8 @@ def summarise(result: Optimisation) -> dict[str, Any]:
 
     return {
         "start": _value_or_none(lambda: first.objective),
-        "reference": _value_or_none(lambda: full_block(problem.scene, *actuations)),
+        "reference": _value_or_none(lambda: farthest(problem.scene, full_block, *actuations)),
+        "reference_drawn": _value_or_none(lambda: farthest(problem.scene, drawing, *actuations)),
         "optimised": best.objective,
         "post_processed": _value_or_none(lambda: post_processed(problem, best.x)),
         "loose_particles": int(loose(problem.scene, problem.gamma(best.x) >= THRESHOLD).sum()),

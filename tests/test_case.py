@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from walker import CASES, walker
+from walker import CASES, slanted_legs, walker
 
 from mpmopt import runfile
 from mpmopt.case import Case, ProgressBar, main, run
@@ -23,6 +23,7 @@ SMALL = Case(
         least_iterations=12,
         most_iterations=15,
     ),
+    slanted_legs,
 )
 ROOT = Path(__file__).parent.parent
 
@@ -37,6 +38,7 @@ def test_a_small_walker_walks_even_without_its_void(folder):
     _, summary = folder
     assert summary["start"] == pytest.approx(13 / 64, abs=1e-9)
     assert summary["reference"] == pytest.approx(13 / 64, abs=1e-3)  # a full block stays
+    assert summary["reference_drawn"] >= summary["reference"] + 0.05  # slanted legs do travel
     assert summary["optimised"] - summary["reference"] >= 0.05
     assert summary["post_processed"] - summary["reference"] >= 0.03
     assert summary["failed_evaluations"] == 0
@@ -50,7 +52,7 @@ def test_the_folder_holds_run_summary_and_pictures(folder):
     assert names == {"run.h5", "summary.json", "design.png", "history.png"}
     assert json.loads((out / "summary.json").read_text()) == summary
     assert set(summary) >= {
-        "start", "reference", "optimised", "post_processed", "a", "theta", "b",
+        "start", "reference", "reference_drawn", "optimised", "post_processed", "a", "theta", "b",
         "evaluations", "failed_evaluations", "seconds", "stop_reason",
     }  # fmt: skip
     for picture in ("design.png", "history.png"):
@@ -81,6 +83,7 @@ def test_the_command_prints_the_summary_or_an_error(tmp_path, capsys):
     tiny = Case(
         dataclasses.replace(SMALL.scene, steps=10),
         Settings(SMALL.settings.stages[:1], window=1, least_iterations=2, most_iterations=2),
+        slanted_legs,
     )
     assert (
         main("A case.", {"default": SMALL, "tiny": tiny}, ["--tiny", "--out", str(tmp_path)]) == 0

@@ -7,7 +7,7 @@ import pytest
 from conftest import small_scene, worst
 from walker import walker
 
-from mpmopt.binary import distance, full_block, loose, post_processed
+from mpmopt.binary import distance, farthest, full_block, loose, post_processed
 from mpmopt.errors import DesignError, SimulationError
 from mpmopt.problem import Problem
 from mpmopt.verify import COMPLEX_STEP, COMPLEX_TOLERANCE, complex_step_test
@@ -143,9 +143,10 @@ def test_a_black_design_without_its_void_is_the_solid_body(problem):
     value = distance(problem.scene, everything, problem.split(black))
     assert problem.value(black) == pytest.approx(value, rel=1e-13)
     assert post_processed(problem, black) == pytest.approx(value, rel=1e-13)
-    still = problem.join(0.0, 0.0, 0.0, 0.0)
-    actuations = [problem.split(design) for design in (still, black)]
-    assert full_block(problem.scene, *actuations) >= value
+    still, moving = (problem.split(problem.join(0.0, a, -0.3, 0.0)) for a in (0.0, 0.9))
+    values = [farthest(problem.scene, full_block, v) for v in (still, moving)]
+    assert farthest(problem.scene, full_block, still, moving) == max(values)
+    assert distance(problem.scene, everything, moving) == values[1]
 
 
 def test_a_design_is_transferred_to_another_grid_as_it_looks():
