@@ -1,4 +1,4 @@
-"""Commands on run files: ``python -m mpmopt verify DIR/run.h5``."""
+"""Commands on run files: ``python -m mpmopt verify DIR/run.h5`` and so on."""
 
 from __future__ import annotations
 
@@ -25,6 +25,32 @@ def verify(path: Path) -> int:
     return 1 if failed else 0
 
 
+def postprocess(path: Path, threshold: float) -> int:
+    """Print what a run's best design does once it is solid or absent everywhere."""
+    import numpy as np
+
+    from mpmopt import runfile
+    from mpmopt.binary import farthest, full_block, pieces, post_processed
+
+    run = runfile.read(path)
+    problem, x = run.problem(), run.best
+    optimised = problem.value(x)
+    value = post_processed(problem, x, threshold)
+    reference = run.summary.get("reference") or farthest(
+        problem.scene, full_block, problem.split(x)
+    )
+    keep = problem.gamma(x) >= threshold
+    sizes = np.bincount(pieces(problem.scene, keep)[keep])
+    print(f"reference (full block)   {reference:.4f}")
+    print(f"optimised                {optimised:.4f}")
+    print(f"post-processed           {value:.4f}  (gamma >= {threshold:g} solid, the rest removed)")
+    print(f"share of the gain kept   {(value - reference) / (optimised - reference):.1%}")
+    print(f"design particles kept    {keep.sum()} of {keep.size}")
+    loose = ", ".join(str(size) for size in sorted(sizes[1:], reverse=True)) or "none"
+    print(f"pieces hanging on nothing, particles of each: {loose}")
+    return 0
+
+
 def main(argv: list[str] | None = None) -> int:
     """Run a command; 0 if all is well, 1 if not, 2 if it was not understood."""
     parser = argparse.ArgumentParser(prog="python -m mpmopt", description=__doc__)
@@ -32,6 +58,12 @@ def main(argv: list[str] | None = None) -> int:
     command = commands.add_parser("verify", help="check the gradients of a run's best design")
     command.add_argument("path", type=Path, metavar="RUN.h5")
     command.set_defaults(do=lambda arguments: verify(arguments.path))
+    command = commands.add_parser("postprocess", help="remove the void of a run's best design")
+    command.add_argument("path", type=Path, metavar="RUN.h5")
+    command.add_argument(
+        "--threshold", type=float, default=0.3, help="gamma from which a particle stays (0.3)"
+    )
+    command.set_defaults(do=lambda arguments: postprocess(arguments.path, arguments.threshold))
     arguments = parser.parse_args(argv)
     try:
         return int(arguments.do(arguments))

@@ -76,8 +76,10 @@ def post_processed(problem: Problem, x: NDArray, threshold: float = THRESHOLD) -
     return distance(problem.scene, problem.gamma(x) >= threshold, problem.split(x))
 
 
-def loose(scene: Scene, keep: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Kept design particles that hang on nothing: no chain of neighbours leads to a solid region.
+def pieces(scene: Scene, keep: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Number of the connected piece that each kept design particle belongs to.
+
+    Neighbours on the particles' lattice hold together; piece 0 holds to a solid region.
 
     Parameters
     ----------
@@ -87,7 +89,8 @@ def loose(scene: Scene, keep: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
     Returns
     -------
-    (D,) array of bool
+    (D,) array of int
+        0: held; 1, 2, ...: pieces that hang on nothing; -1: not there.
     """
     particles = lay_out(scene)
     there = ~particles.designed
@@ -96,9 +99,10 @@ def loose(scene: Scene, keep: NDArray[np.bool_]) -> NDArray[np.bool_]:
     i, j = (index - index.min(axis=0)).T
     lattice = np.zeros((i.max() + 1, j.max() + 1), dtype=bool)
     lattice[i, j] = there
-    pieces = label(lattice)[0][i, j]
-    held = np.isin(pieces, pieces[~particles.designed])
-    return (there & ~held)[particles.designed]
+    labels = label(lattice)[0][i, j]
+    held = np.isin(labels, labels[~particles.designed])
+    _, number = np.unique(np.where(held, 0, labels), return_inverse=True)  # solid regions are 0
+    return np.where(there, number, -1)[particles.designed]
 
 
 def full_block(positions: NDArray[np.float64]) -> NDArray[np.bool_]:

@@ -16,7 +16,7 @@ import numpy as np
 from tqdm import tqdm
 
 from mpmopt import runfile
-from mpmopt.binary import THRESHOLD, Drawing, farthest, full_block, loose, post_processed
+from mpmopt.binary import THRESHOLD, Drawing, farthest, full_block, pieces, post_processed
 from mpmopt.checkpoints import Checkpointing
 from mpmopt.errors import MpmoptError, SimulationError, StorageError
 from mpmopt.optimize import Optimisation, Settings, Stage, optimise
@@ -146,6 +146,7 @@ def run(case: Case, out: Path, checkpointing: Checkpointing | None = None) -> di
         checkpointing,
     )
     summary = summarise(result, case.drawing)
+    runfile.write(path, result, summary)
     text = json.dumps(summary, indent=1) + "\n"
     runfile.replace_file(out / "summary.json", text.encode())
     _draw(out, result, summary)
@@ -172,7 +173,9 @@ def summarise(result: Optimisation, drawing: Drawing) -> dict[str, Any]:
         "reference_drawn": _value_or_none(lambda: farthest(problem.scene, drawing, *actuations)),
         "optimised": best.objective,
         "post_processed": _value_or_none(lambda: post_processed(problem, best.x)),
-        "loose_particles": int(loose(problem.scene, problem.gamma(best.x) >= THRESHOLD).sum()),
+        "loose_particles": int(
+            (pieces(problem.scene, problem.gamma(best.x) >= THRESHOLD) > 0).sum()
+        ),
         "post_processed_half_step": _value_or_none(lambda: post_processed(half, best.x)),
         "greyness": best.greyness,
         "a": numbers(actuation.a),

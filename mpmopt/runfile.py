@@ -2,7 +2,7 @@
 
 Layout (version 1)::
 
-    attributes       format, version, scene and settings (JSON), versions (JSON), stop_reason
+    attributes       format, version, stop_reason; as JSON: scene, settings, versions, summary
     history/NAME     one entry per evaluation: objective, beta, greyness, step, ...
     stages/K/        best design of stage K: x, gamma; attributes of its evaluation
     best/            the best of all, with phi, a, theta, b spelled out; attribute stage
@@ -15,6 +15,7 @@ import json
 import os
 import platform
 import tempfile
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -54,6 +55,8 @@ class RunFile:
         Stage of the best design of all; None if no evaluation succeeded.
     stop_reason : str
         Empty if the run was not finished.
+    summary : dict
+        That of `case.summarise`; empty if there is none yet.
     """
 
     scene: Scene
@@ -64,6 +67,7 @@ class RunFile:
     time_steps: dict[int, float]
     best_stage: int | None
     stop_reason: str
+    summary: dict[str, Any]
 
     @property
     def best(self) -> NDArray[np.float64]:
@@ -89,8 +93,15 @@ class RunFile:
         return index
 
 
-def write(path: Path, run: Optimisation) -> None:
+def write(path: Path, run: Optimisation, summary: Mapping[str, Any] | None = None) -> None:
     """Write a run as it stands; an older file of that name is replaced only by a complete one.
+
+    Parameters
+    ----------
+    path : Path
+    run : Optimisation
+    summary : mapping, optional
+        Of a finished run.
 
     Raises
     ------
@@ -100,6 +111,7 @@ def write(path: Path, run: Optimisation) -> None:
     # HDF5 does not survive a write that fails, so it writes to memory only.
     with h5py.File(f"run-{uuid4()}", "w", driver="core", backing_store=False) as file:
         _fill(file, run)
+        file.attrs["summary"] = json.dumps(dict(summary or {}))
         file.flush()
         image = file.id.get_file_image()
     replace_file(Path(path), image)
@@ -211,6 +223,7 @@ def read(path: Path) -> RunFile:
                 best_stage=int(file["best"].attrs["stage"]) if "best" in file else None,
                 time_steps={k: float(file[f"stages/{k}"].attrs["time_step"]) for k in stages},
                 stop_reason=str(file.attrs["stop_reason"]),
+                summary=dict(json.loads(file.attrs["summary"])),
             )
     except MpmoptError as error:
         if isinstance(error, RunFileError):

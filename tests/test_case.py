@@ -62,6 +62,7 @@ def test_the_folder_holds_run_summary_and_pictures(folder):
     kept = runfile.read(out / "run.h5")
     assert kept.scene == SMALL.scene
     assert kept.stop_reason == summary["stop_reason"]
+    assert kept.summary == summary
     assert kept.problem().value(kept.best) == summary["optimised"]
 
 

@@ -7,7 +7,7 @@ import pytest
 from conftest import small_scene, worst
 from walker import walker
 
-from mpmopt.binary import distance, farthest, full_block, loose, post_processed
+from mpmopt.binary import distance, farthest, full_block, pieces, post_processed
 from mpmopt.errors import DesignError, SimulationError
 from mpmopt.problem import Problem
 from mpmopt.verify import COMPLEX_STEP, COMPLEX_TOLERANCE, complex_step_test
@@ -120,15 +120,19 @@ def test_a_gradient_at_a_complex_design_is_refused(problem, x):
         problem.value(np.array(["a"] * x.size))
 
 
-def test_loose_particles_hang_on_nothing(problem):
-    gamma = np.zeros(32, dtype=bool)
+def test_pieces_that_hang_on_nothing_are_numbered(problem):
     position = problem.particles.position[problem.particles.designed] * 32  # in spacings
-    column = (position[:, 0] > 6) & (position[:, 0] < 7)
-    assert not loose(problem.scene, column).any()  # reaches up to the actuator
-    low = position[:, 1] < 9
-    assert loose(problem.scene, low).sum() == low.sum() == 8  # the lowest row alone
-    assert not loose(problem.scene, gamma).any()
-    assert not loose(problem.scene, low | column).any()
+    x, y = position.T
+    column = (x > 6) & (x < 7)
+    assert set(pieces(problem.scene, column)[column]) == {0}  # reaches up to the actuator
+    low = y < 9
+    assert np.array_equal(pieces(problem.scene, low), np.where(low, 1, -1))
+    two = low & ((x < 8) | (x > 12))
+    assert np.array_equal(np.unique(pieces(problem.scene, two)), [-1, 1, 2])
+    assert set(pieces(problem.scene, low | column)) == {-1, 0}
+    everything = np.ones(32, dtype=bool)
+    assert np.all(pieces(problem.scene, everything) == 0)
+    assert np.all(pieces(problem.scene, ~everything) == -1)
 
 
 def test_a_result_that_is_not_finite_never_leaves(problem, x, monkeypatch):

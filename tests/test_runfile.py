@@ -12,6 +12,7 @@ import pytest
 from conftest import small_scene
 
 from mpmopt import runfile
+from mpmopt.binary import post_processed
 from mpmopt.errors import RunFileError, StorageError
 from mpmopt.optimize import Settings, Stage, optimise
 from mpmopt.problem import Problem
@@ -38,6 +39,7 @@ def test_a_run_is_read_back_as_it_was(run, path):
     assert back.scene == run.scene
     assert back.settings == run.settings
     assert back.stop_reason == run.stop_reason
+    assert back.summary == {}
     assert set(back.versions) == {"mpmopt", "python", "numba", "numpy", "scipy", "h5py"}
     for name in runfile.COLUMNS:
         column = [getattr(item, name) for item in run.history]
@@ -174,6 +176,18 @@ def test_verify_of_no_run_file_says_so_and_fails(tmp_path):
     assert done.returncode == 1
     assert done.stderr.startswith("RunFileError: ")
     assert "Traceback" not in done.stderr
+
+
+def test_postprocess_prints_the_share_of_the_gain_kept(run, path):
+    done = command("postprocess", path, "--threshold", "0.4")
+    assert done.returncode == 0, done.stderr
+    assert f"optimised                {run.result.objective:.4f}" in done.stdout
+    problem = run.problem()
+    value = post_processed(problem, run.result.x, 0.4)
+    assert f"post-processed           {value:.4f}  (gamma >= 0.4" in done.stdout
+    assert f"{(problem.gamma(run.result.x) >= 0.4).sum()} of 32" in done.stdout
+    assert "share of the gain kept" in done.stdout
+    assert "hanging on nothing" in done.stdout
 
 
 def test_an_unknown_command_is_not_understood():
