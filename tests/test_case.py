@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import crawler
 import pytest
 from walker import CASES, slanted_legs, walker
 
@@ -44,6 +45,17 @@ def test_a_small_walker_walks_even_without_its_void(folder):
     assert summary["failed_evaluations"] == 0
     assert summary["loose_particles"] >= 0
     assert summary["evaluations"] <= 30
+
+
+def test_a_small_crawler_crawls_even_without_its_void(tmp_path):
+    case = Case(crawler.crawler(64, 8e-4), SMALL.settings, crawler.slanted_legs)
+    summary = run(case, tmp_path)
+    assert summary["start"] == pytest.approx(23 / 64, abs=1e-9)
+    assert summary["reference"] == pytest.approx(23 / 64, abs=1e-3)
+    assert summary["reference_drawn"] >= summary["reference"] + 0.02
+    assert summary["optimised"] - summary["reference"] >= 0.05
+    assert summary["post_processed"] - summary["reference"] >= 0.03
+    assert summary["failed_evaluations"] == 0
 
 
 def test_the_folder_holds_run_summary_and_pictures(folder):
