@@ -94,6 +94,8 @@ class Settings:
         Successful evaluations of a stage.
     most_failures : int
         Failed evaluations in a row after which the optimisation gives up.
+    scouting : int
+        Of several starts, each goes through so many of the first stages; then the best goes on.
 
     Raises
     ------
@@ -111,6 +113,7 @@ class Settings:
     least_iterations: int = 20
     most_iterations: int = 200
     most_failures: int = 8
+    scouting: int = 0
 
     def __post_init__(self) -> None:
         if not self.stages or not all(isinstance(stage, Stage) for stage in self.stages):
@@ -119,6 +122,12 @@ class Settings:
         for name in ("window", "least_iterations", "most_iterations", "most_failures"):
             object.__setattr__(
                 self, name, count("Settings", name, getattr(self, name), 1, error=DesignError)
+            )
+        scouting = count("Settings", "scouting", self.scouting, 0, error=DesignError)
+        object.__setattr__(self, "scouting", scouting)
+        if scouting > len(self.stages):
+            raise DesignError(
+                f"Settings: scouting = {scouting} is above the number of stages {len(self.stages)}"
             )
         for name in ("move_limit", "tolerance"):
             object.__setattr__(
@@ -141,6 +150,8 @@ class Iteration:
 
     Attributes
     ----------
+    start : int
+        Index of the start that it goes back to.
     stage : int
         Index of the stage.
     beta, time_step, move_limit : float
@@ -165,6 +176,7 @@ class Iteration:
         Why the evaluation failed, or empty.
     """
 
+    start: int
     stage: int
     beta: float
     time_step: float
@@ -239,7 +251,7 @@ Callback = Callable[[Optimisation], None]
 def optimise(
     scene: Scene,
     settings: Settings,
-    start: NDArray[np.float64],
+    start: NDArray[np.float64] | Sequence[NDArray[np.float64]],
     callbacks: Iterable[Callback] = (),
     checkpointing: Checkpointing | None = None,
 ) -> Optimisation:
@@ -252,8 +264,9 @@ def optimise(
     ----------
     scene : Scene
     settings : Settings
-    start : (n,) array
-        First design, within [-1, 1], of the first stage's scene (`Problem.join` makes it).
+    start : (n,) array, or several
+        First design, within [-1, 1], of the first stage's scene (`Problem.join` makes it). Of
+        several the best after `Settings.scouting` stages goes on.
     callbacks : iterable of callable
         Called after each evaluation and once at the end.
     checkpointing : Checkpointing, optional
@@ -267,45 +280,92 @@ def optimise(
     StorageError
         If checkpoints cannot be stored.
     """
+    starts = [start] if isinstance(start, np.ndarray) else list(start)
     scenes = [stage.scene(scene) for stage in settings.stages]
-    run = Optimisation(scene, settings)
-    callbacks = tuple(callbacks)
-    began = time.monotonic()
-    x = np.array(start, dtype=float)
-    if x.size == 0:
-        raise DesignError("the scene has no design variables: give it a Design or an Actuator")
-    reason = ""
-    for index, stage in enumerate(settings.stages):
-        stage_run = _StageRun(run, index, stage, scenes[index], checkpointing, callbacks, began)
-        if index > 0 and stage.coarsening != settings.stages[index - 1].coarsening:
-            x = stage_run.problem.transfer(Problem(scenes[index - 1]), x)
-        x, reason, gave_up = stage_run.climb(x)
-        logger.info("stage %d (beta %g): %s", index, stage.beta, reason)
-        if gave_up:
-            break
-    run.stop_reason = f"Stage {index + 1} of {len(settings.stages)} was the last: {reason}"
-    for callback in callbacks:
-        callback(run)
-    return run
+    first = Problem(scenes[0])
+    designs = [first.join(*first.split(x)) for x in starts]
+    if not designs or first.size == 0:
+        raise DesignError("there is nothing to design: give a Design or an Actuator, and a start")
+    if len(designs) > 1 and settings.scouting == 0:
+        raise DesignError(f"{len(designs)} starts need Settings.scouting >= 1, the stages of each")
+    climb = _Climb(Optimisation(scene, settings), scenes, tuple(callbacks), checkpointing)
+    scouting = settings.scouting if len(designs) > 1 else 0
+    scouted = [climb.stages(0, scouting, number, x) for number, x in enumerate(designs)]
+    chosen = max(scouted, key=lambda leg: leg.merit)
+    climb.run.best = chosen.best
+    last = chosen if chosen.gave_up else climb.stages(scouting, len(scenes), chosen.start, chosen.x)
+    reached = last.stage + 1
+    climb.run.stop_reason = f"Stage {reached} of {len(scenes)} was the last: {last.reason}"
+    climb.report()
+    return climb.run
+
+
+@dataclass
+class _Leg:
+    """How far one start has come."""
+
+    start: int
+    x: NDArray[np.float64]
+    stage: int = 0
+    reason: str = ""
+    gave_up: bool = False
+    best: dict[int, Iteration] = field(default_factory=dict)
+
+    @property
+    def merit(self) -> tuple[int, float]:
+        """What the starts are compared by: the last stage that had a design, and its best."""
+        if not self.best:
+            return -1, -np.inf
+        item = self.best[max(self.best)]
+        return item.stage, item.objective if np.isnan(item.post_processed) else item.post_processed
+
+
+class _Climb:
+    """An optimisation on its way through the stages."""
+
+    def __init__(
+        self,
+        run: Optimisation,
+        scenes: list[Scene],
+        callbacks: tuple[Callback, ...],
+        checkpointing: Checkpointing | None,
+    ) -> None:
+        self.run, self.scenes = run, scenes
+        self.callbacks, self.checkpointing = callbacks, checkpointing
+        self.began = time.monotonic()
+
+    def report(self) -> None:
+        for callback in self.callbacks:
+            callback(self.run)
+
+    def stages(self, first: int, last: int, start: int, x: NDArray[np.float64]) -> _Leg:
+        """Climb from x through the stages from `first` to before `last`."""
+        leg = _Leg(start, x)
+        if first == 0:
+            self.run.best = {}
+        for index in range(first, last):
+            stage = _StageRun(self, index, start)
+            if (
+                index > 0
+                and stage.stage.coarsening != self.run.settings.stages[index - 1].coarsening
+            ):
+                leg.x = stage.problem.transfer(Problem(self.scenes[index - 1]), leg.x)
+            leg.stage = index
+            leg.x, leg.reason, leg.gave_up = stage.climb(leg.x)
+            logger.info("start %d, stage %d: %s", start, index, leg.reason)
+            if leg.gave_up:
+                break
+        leg.best = dict(self.run.best)
+        return leg
 
 
 class _StageRun:
     """One stage on its way."""
 
-    def __init__(
-        self,
-        run: Optimisation,
-        index: int,
-        stage: Stage,
-        scene: Scene,
-        checkpointing: Checkpointing | None,
-        callbacks: Sequence[Callback],
-        began: float,
-    ) -> None:
-        self.run, self.index, self.stage = run, index, stage
-        self.callbacks, self.began = callbacks, began
-        self.checkpointing = checkpointing
-        self.problem = Problem(scene, stage.beta, checkpointing)
+    def __init__(self, whole: _Climb, index: int, start: int) -> None:
+        self.whole, self.run, self.index, self.start = whole, whole.run, index, start
+        self.stage = self.run.settings.stages[index]
+        self.problem = Problem(whole.scenes[index], self.stage.beta, whole.checkpointing)
         self.best_merit: tuple[float, ...] | None = None
         self.best_gradient: NDArray[np.float64] | None = None
 
@@ -368,6 +428,7 @@ class _StageRun:
         free = np.where(gradient > 0.0, x < 1.0, x > -1.0)
         gamma = self.problem.gamma(x)
         iteration = Iteration(
+            start=self.start,
             stage=self.index,
             beta=self.stage.beta,
             time_step=self.problem.scene.time_step,
@@ -378,7 +439,7 @@ class _StageRun:
             greyness=greyness(gamma),
             projected_gradient=float(np.abs(gradient * free).max()),
             step=float(np.abs(x - before).max() / 2.0),
-            seconds=time.monotonic() - self.began,
+            seconds=time.monotonic() - self.whole.began,
             post_processed=solid,
             failure=failure,
         )
@@ -387,8 +448,7 @@ class _StageRun:
         if not failure and (self.best_merit is None or merit > self.best_merit):
             run.best[self.index] = iteration
             self.best_merit, self.best_gradient = merit, gradient
-        for callback in self.callbacks:
-            callback(run)
+        self.whole.report()
         return None if failure else (value, gradient)
 
     def _without_void(self, x: NDArray[np.float64]) -> float:
@@ -402,7 +462,7 @@ class _StageRun:
         scene = self.problem.scene
         logger.warning("no design of this stage ran yet: time step %g halved", scene.time_step)
         self.problem = Problem(
-            scene.vary(time_step=scene.time_step / 2.0), self.stage.beta, self.checkpointing
+            scene.vary(time_step=scene.time_step / 2.0), self.stage.beta, self.whole.checkpointing
         )
 
     def _stop_reason(self, values: list[float]) -> str:

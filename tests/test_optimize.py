@@ -157,7 +157,7 @@ def test_a_stage_that_cannot_run_is_refused_before_any_evaluation(scene, start, 
 
 def test_a_scene_with_nothing_to_design_is_refused(scene):
     bare = dataclasses.replace(scene, body=scene.body[2:3])
-    with pytest.raises(DesignError, match="no design variables"):
+    with pytest.raises(DesignError, match="nothing to design"):
         optimise(bare, QUICK, np.zeros(0))
 
 
@@ -165,6 +165,38 @@ def test_the_result_is_the_design_that_goes_farthest_without_void(scene, start):
     both = [dataclasses.replace(stage, solid=True) for stage in STAGES]
     run = optimise(scene, dataclasses.replace(QUICK, stages=tuple(both)), start)
     assert run.result.post_processed == max(item.post_processed for item in run.history)
+
+
+def test_of_several_starts_the_best_goes_on(scene, start):
+    problem = Problem(scene)
+    other = problem.join(0.0, 1.0, 0.7, -0.5)
+    settings = dataclasses.replace(QUICK, scouting=1, least_iterations=11, most_iterations=11)
+    run = optimise(scene, settings, [start, other])
+    assert [(item.start, item.stage) for item in run.history[:22]] == 11 * [(0, 0)] + 11 * [(1, 0)]
+    scouted = [max(item.objective for item in run.history if item.start == k and item.stage == 0)
+               for k in (0, 1)]  # fmt: skip
+    winner = int(np.argmax(scouted))
+    assert scouted[0] != scouted[1]
+    assert {item.start for item in run.history[22:]} == {winner}
+    assert run.best[0].objective == scouted[winner]
+    assert run.result.start == winner
+    # The winner's way is the one it goes alone.
+    alone = optimise(scene, dataclasses.replace(settings, scouting=0), [start, other][winner])
+    assert np.array_equal(alone.result.x, run.result.x)
+
+
+def test_a_start_that_never_runs_does_not_stop_the_others(scene, start, monkeypatch):
+    fail_on(monkeypatch, set(range(4)))
+    settings = dataclasses.replace(QUICK, scouting=1, least_iterations=11, most_iterations=11)
+    run = optimise(scene, settings, [start, 0.5 * start])
+    assert run.result.start == 1
+    assert run.stop_reason.startswith("Stage 2 of 2")
+
+
+@pytest.mark.parametrize("scouting", [0, -1, 3, 1.5])
+def test_senseless_scouting_is_refused(scene, start, scouting):
+    with pytest.raises(DesignError, match="scouting"):
+        optimise(scene, dataclasses.replace(QUICK, scouting=scouting), [start, start])
 
 
 def test_a_start_that_does_not_fit_is_refused(scene):
