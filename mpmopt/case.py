@@ -24,6 +24,7 @@ from mpmopt.problem import Problem, Variables
 from mpmopt.scene import Scene
 
 START = {"phi": 0.0, "a": 1.0, "theta": -0.3, "b": -0.5}
+QUARTER_TURNS = (0.0, 0.5, 1.0, -0.5)  # of theta, for the starts that scout
 
 
 @dataclass(frozen=True)
@@ -71,10 +72,11 @@ def refined(coarse_time_step: float, time_step: float) -> Settings:
     """Cells twice as wide find the gait, up to beta = 8; the scene's own find the shape.
 
     The fine stages have beta = 8, 16 and 32, a mass floor of 1e-2, and are judged without void.
+    Four starts, whose signals are a quarter turn apart, scout the first three stages.
     """
     coarse = _sharpening(coarse_time_step, stages=5, coarsening=2)
     fine = tuple(Stage(beta, 1e-2, 1e-3, time_step, solid=True) for beta in (8.0, 16.0, 32.0))
-    return Settings((*coarse, *fine), most_iterations=25)
+    return Settings((*coarse, *fine), most_iterations=25, scouting=3)
 
 
 def published(time_step: float) -> Settings:
@@ -137,11 +139,13 @@ def run(case: Case, out: Path, checkpointing: Checkpointing | None = None) -> di
     except OSError as error:
         raise StorageError(f"cannot write to {out}: {error}; choose another folder") from error
     first = case.settings.stages[0]
-    start = Problem(first.scene(case.scene), first.beta).join(**START)
+    problem = Problem(first.scene(case.scene), first.beta)
+    turns = QUARTER_TURNS if case.settings.scouting else (0.0,)
+    starts = [problem.join(**{**START, "theta": START["theta"] + turn}) for turn in turns]
     result = optimise(
         case.scene,
         case.settings,
-        start,
+        starts,
         [lambda current: runfile.write(path, current), ProgressBar()],
         checkpointing,
     )
