@@ -43,8 +43,16 @@ NODE_SIZE = 4  # one vector register: momentum and mass (q_x, q_y, m, 0), veloci
 DONE, WINDOW_TOO_SMALL, ESCAPED, INVERTED = 0, 1, 2, 3
 
 # No "nnan" or "ninf": comparisons must see what is not a number.
-jit = njit(cache=True, nogil=True, error_model="numpy",
-           fastmath={"contract", "reassoc", "nsz", "arcp"})  # fmt: skip
+OPTIONS = {
+    "cache": True,
+    "nogil": True,
+    "error_model": "numpy",
+    "fastmath": {"contract", "reassoc", "nsz", "arcp"},
+}
+loop_jit = njit(**OPTIONS)
+# Kernels become part of the loops that call them: which of several compiled copies a loop calls
+# would otherwise depend on whether it came from the disk cache, and with it the last bits.
+jit = njit(**OPTIONS, forceinline=True)
 
 
 class World(NamedTuple):
@@ -555,7 +563,7 @@ def g2p_adjoint(old, new, world, scratch, window, bar):
         )
 
 
-@jit
+@loop_jit
 def advance(states, grids, windows, logs, first, last, body, world, signal, scratch):
     """Advance from the start of step `first` to the start of step `last`.
 
@@ -590,7 +598,7 @@ def advance(states, grids, windows, logs, first, last, body, world, signal, scra
     return last, DONE if particle < 0 else ESCAPED, particle
 
 
-@jit
+@loop_jit
 def advance_adjoint(states, grids, windows, logs, first, last, body, world, signal, scratch, bar,
                     body_bar, signal_bar):  # fmt: skip
     """Go back from the start of step `last` to the start of step `first`: the adjoint of `advance`.
