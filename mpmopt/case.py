@@ -71,11 +71,15 @@ def sharpened(time_step: float) -> Settings:
 def refined(coarse_time_step: float, time_step: float) -> Settings:
     """Cells twice as wide find the gait, up to beta = 8; the scene's own find the shape.
 
-    The fine stages have beta = 8, 16 and 32, a mass floor of 1e-2, and are judged without void.
+    The fine stages have beta = 8, 16 and 32, a mass floor of 1e-2 and a move limit of 0.02, which
+    does not lose the gait, and are judged without void.
     Four starts, whose signals are a quarter turn apart, scout the first three stages.
     """
     coarse = _sharpening(coarse_time_step, stages=5, coarsening=2)
-    fine = tuple(Stage(beta, 1e-2, 1e-3, time_step, solid=True) for beta in (8.0, 16.0, 32.0))
+    fine = tuple(
+        Stage(beta, 1e-2, 1e-3, time_step, solid=True, move_limit=0.02)
+        for beta in (8.0, 16.0, 32.0)
+    )
     return Settings((*coarse, *fine), most_iterations=25, scouting=3)
 
 
@@ -85,8 +89,7 @@ def published(time_step: float) -> Settings:
     Each stage goes on from the last design of the one before.
     """
     return Settings(
-        tuple(Stage(0.5 * 2**k, 1e-3, 1e-3, time_step) for k in range(6)),
-        move_limit=0.5,
+        tuple(Stage(0.5 * 2**k, 1e-3, 1e-3, time_step, move_limit=0.5) for k in range(6)),
         adapt_move_limit=False,
         sharpen_asymptotes=False,
         best_first=False,

@@ -27,7 +27,7 @@ Sources: Hu et al. 2018 (MLS-MPM), Jiang et al. 2015 (APIC), Sato et al. 2023 (a
 """
 
 import operator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from llvmlite import ir
@@ -43,7 +43,7 @@ NODE_SIZE = 4  # one vector register: momentum and mass (q_x, q_y, m, 0), veloci
 DONE, WINDOW_TOO_SMALL, ESCAPED, INVERTED = 0, 1, 2, 3
 
 # No "nnan" or "ninf": comparisons must see what is not a number.
-OPTIONS = {
+OPTIONS: dict[str, Any] = {
     "cache": True,
     "nogil": True,
     "error_model": "numpy",

@@ -44,6 +44,13 @@ class Stage:
         (`binary.post_processed`), which costs a forward run more, instead of as it is.
     coarsening : int
         How many of the scene's cells go into the width of this stage's: early stages need no more.
+    move_limit : float
+        Greatest step of a variable, as a fraction of its range.
+
+    Raises
+    ------
+    DesignError
+        If a number makes no sense.
     """
 
     beta: float
@@ -52,11 +59,14 @@ class Stage:
     time_step: float
     solid: bool = False
     coarsening: int = 1
+    move_limit: float = 0.05
 
     def __post_init__(self) -> None:
-        for name in ("beta", "mass_floor", "stiffness_floor", "time_step"):
+        for name in ("beta", "mass_floor", "stiffness_floor", "time_step", "move_limit"):
             value = number("Stage", name, getattr(self, name), above=0.0, error=DesignError)
             object.__setattr__(self, name, value)
+        if self.move_limit > 1.0:
+            raise DesignError(f"Stage: move_limit = {self.move_limit} must be at most 1")
         coarsening = count("Stage", "coarsening", self.coarsening, 1, error=DesignError)
         object.__setattr__(self, "coarsening", coarsening)
 
@@ -77,10 +87,8 @@ class Settings:
     Attributes
     ----------
     stages : tuple of Stage
-    move_limit : float
-        Greatest step of a variable, as a fraction of its range.
     adapt_move_limit : bool
-        Shorten the move limit after a step that went back, and lengthen it, up to `move_limit`,
+        Shorten the move limit after a step that went back, and lengthen it, up to the stage's,
         after one that went on.
     sharpen_asymptotes : bool
         Initial asymptotes at 0.5 / (beta + 1) of the range instead of 0.5.
@@ -104,7 +112,6 @@ class Settings:
     """
 
     stages: tuple[Stage, ...]
-    move_limit: float = 0.05
     adapt_move_limit: bool = True
     sharpen_asymptotes: bool = True
     best_first: bool = True
@@ -129,17 +136,13 @@ class Settings:
             raise DesignError(
                 f"Settings: scouting = {scouting} is above the number of stages {len(self.stages)}"
             )
-        for name in ("move_limit", "tolerance"):
-            object.__setattr__(
-                self, name, number("Settings", name, getattr(self, name), error=DesignError)
-            )
+        tolerance = number("Settings", "tolerance", self.tolerance, error=DesignError)
+        object.__setattr__(self, "tolerance", tolerance)
         if self.least_iterations > self.most_iterations:
             raise DesignError(
                 f"Settings: least_iterations = {self.least_iterations} is above "
                 f"most_iterations = {self.most_iterations}"
             )
-        if not 0.0 < self.move_limit <= 1.0:
-            raise DesignError(f"Settings: move_limit = {self.move_limit} must be in (0, 1]")
         if self.tolerance < 0.0:
             raise DesignError(f"Settings: tolerance = {self.tolerance} must not be negative")
 
@@ -378,7 +381,7 @@ class _StageRun:
         mma = MovingAsymptotes(
             -np.ones(x.size),
             np.ones(x.size),
-            move_limit=settings.move_limit,
+            move_limit=self.stage.move_limit,
             asymptote_initial=0.5 / (self.stage.beta + 1.0) if settings.sharpen_asymptotes else 0.5,
         )
         values: list[float] = []
@@ -407,7 +410,7 @@ class _StageRun:
                 return (self.run.best[self.index].x if settings.best_first else x), stop, False
             went_back = len(values) > 1 and value < values[-2]
             factor = SHORTEN if went_back and settings.adapt_move_limit else LENGTHEN
-            mma.move_limit = min(settings.move_limit, factor * mma.move_limit)
+            mma.move_limit = min(self.stage.move_limit, factor * mma.move_limit)
             x = mma.step(x, -value, -gradient)
 
     def _evaluate(
