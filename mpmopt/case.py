@@ -69,16 +69,15 @@ def sharpened(time_step: float) -> Settings:
 
 
 def refined(coarse_time_step: float, time_step: float) -> Settings:
-    """Cells twice as wide find the gait, up to beta = 8; the scene's own find the shape.
+    """Cells twice as wide find the gait and most of the shape, then the scene's own finish it.
 
-    The fine stages have beta = 8, 16 and 32, a mass floor of 1e-2 and a move limit of 0.02, which
-    does not lose the gait, and are judged without void.
-    Four starts, whose signals are a quarter turn apart, scout the first three stages.
+    The coarse stages are `sharpened`'s; four starts, whose signals are a quarter turn apart, scout
+    the first three. The fine ones have beta = 16 and 32, a mass floor of 1e-2 and short moves,
+    which do not lose the gait, and are judged without void.
     """
-    coarse = _sharpening(coarse_time_step, stages=5, coarsening=2)
+    coarse = _sharpening(coarse_time_step, stages=7, coarsening=2)
     fine = tuple(
-        Stage(beta, 1e-2, 1e-3, time_step, solid=True, move_limit=0.02)
-        for beta in (8.0, 16.0, 32.0)
+        Stage(beta, 1e-2, 1e-3, time_step, solid=True, move_limit=0.02) for beta in (16.0, 32.0)
     )
     return Settings((*coarse, *fine), most_iterations=25, scouting=3)
 

@@ -219,9 +219,10 @@ class Optimisation:
 
     @property
     def result(self) -> Iteration:
-        """The best evaluation: the one that goes farthest without void, where stages ask for that.
+        """The best evaluation on the last stage's grid.
 
-        Else the best of the last stage that had one, whose projection is the sharpest.
+        That is the one that goes farthest without void, where stages ask for that; else the best of
+        the last stage that had one, whose projection is the sharpest.
 
         Raises
         ------
@@ -231,8 +232,10 @@ class Optimisation:
         if not self.best:
             last = self.history[-1].failure if self.history else "none was made"
             raise DesignError(f"no evaluation succeeded; the last: {last}")
+        stages = self.settings.stages
+        grid = stages[max(self.best)].coarsening
         return max(
-            self.best.values(),
+            (item for stage, item in self.best.items() if stages[stage].coarsening == grid),
             key=lambda item: (np.nan_to_num(item.post_processed, nan=-np.inf), item.stage),
         )
 

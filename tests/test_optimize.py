@@ -81,7 +81,10 @@ def test_each_stage_starts_from_the_last_ones_best(scene, start):
 def test_a_coarse_stage_hands_its_best_design_to_the_finer_grid():
     scene = walker(128, 4e-4)
     scene = dataclasses.replace(scene, steps=100)
-    stages = (Stage(0.5, 1e-2, 1e-3, 8e-4, coarsening=2), Stage(1.0, 1e-2, 1e-3, 4e-4))
+    stages = (
+        Stage(0.5, 1e-2, 1e-3, 8e-4, solid=True, coarsening=2),
+        Stage(1.0, 1e-2, 1e-3, 4e-4),
+    )
     settings = Settings(stages, window=1, least_iterations=3, most_iterations=3)
     coarse = Problem(stages[0].scene(scene))
     run = optimise(scene, settings, coarse.join(0.0, 1.0, -0.3, -0.5))
@@ -90,6 +93,7 @@ def test_a_coarse_stage_hands_its_best_design_to_the_finer_grid():
     handed = Problem(scene).transfer(coarse, run.best[0].x)
     assert np.array_equal(second.x, handed)
     assert second.step == 0.0
+    assert run.result.stage == 1  # whatever the coarse grid says
 
 
 def test_the_moving_average_ends_a_stage(scene, start):
