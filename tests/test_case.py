@@ -20,7 +20,7 @@ from mpmopt.problem import Problem
 SMALL = Case(
     walker(64, 8e-4),
     Settings(
-        (Stage(0.5, 1e-2, 1e-3, 8e-4), Stage(8.0, 1e-2, 1e-3, 8e-4, solid=True)),
+        (Stage(0.5, 1e-2, 1e-3, 8e-4), Stage(4.0, 1e-2, 1e-3, 8e-4, solid=True)),
         least_iterations=12,
         most_iterations=15,
     ),
@@ -53,7 +53,7 @@ def test_a_small_crawler_crawls_even_without_its_void(tmp_path):
     assert summary["start"] == pytest.approx(23 / 64, abs=1e-9)
     assert summary["reference"] == pytest.approx(23 / 64, abs=1e-3)
     assert summary["reference_drawn"] >= summary["reference"] + 0.02
-    assert summary["optimised"] - summary["reference"] >= 0.03
+    assert summary["optimised"] - summary["reference"] >= 0.05
     assert summary["post_processed"] - summary["reference"] >= 0.03
     assert summary["failed_evaluations"] == 0
 
