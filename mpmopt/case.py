@@ -68,16 +68,19 @@ def sharpened(time_step: float) -> Settings:
     return Settings(_sharpening(time_step, stages=7), most_iterations=25)
 
 
-def refined(coarse_time_step: float, time_step: float) -> Settings:
-    """Cells twice as wide find the gait and most of the shape, then the scene's own finish it.
+def refined(coarse_time_step: float, time_step: float, coarse_stages: int) -> Settings:
+    """Cells twice as wide find the gait, then the scene's own finish the shape.
 
-    The coarse stages are `sharpened`'s; four starts, whose signals are a quarter turn apart, scout
-    the first three. The fine ones have beta = 16 and 32, a mass floor of 1e-2 and short moves,
-    which do not lose the gait, and are judged without void.
+    The coarse stages are the first of `sharpened`; four starts, whose signals are a quarter turn
+    apart, scout three of them. The fine ones go on to beta = 32, beginning at 16 at the latest,
+    with a mass floor of 1e-2 and short moves, which do not lose the gait; they are judged without
+    void.
     """
-    coarse = _sharpening(coarse_time_step, stages=7, coarsening=2)
+    coarse = _sharpening(coarse_time_step, coarse_stages, coarsening=2)
     fine = tuple(
-        Stage(beta, 1e-2, 1e-3, time_step, solid=True, move_limit=0.02) for beta in (16.0, 32.0)
+        Stage(beta, 1e-2, 1e-3, time_step, solid=True, move_limit=0.02)
+        for beta in (8.0, 16.0, 32.0)
+        if beta >= min(coarse[-1].beta, 16.0)
     )
     return Settings((*coarse, *fine), most_iterations=25, scouting=3)
 
