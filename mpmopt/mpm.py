@@ -90,6 +90,11 @@ class BodyBar(NamedTuple):
     lame_lambda: NDArray  # (N,)
     lame_mu: NDArray  # (N,)
 
+    @classmethod
+    def zeros(cls, particles: int) -> "BodyBar":
+        """Nothing accumulated yet, for so many particles."""
+        return cls(*(np.zeros(particles) for _ in cls._fields))
+
 
 class Scratch(NamedTuple):
     """Arrays that live for one step, for N particles and a window of M nodes."""

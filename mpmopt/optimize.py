@@ -79,6 +79,10 @@ class Stage:
             coarsening=self.coarsening,
         )
 
+    def problem(self, scene: Scene, time_step: float) -> Problem:
+        """The problem that this stage solves, in the time step that it ended with."""
+        return Problem(dataclasses.replace(self, time_step=time_step).scene(scene), self.beta)
+
 
 @dataclass(frozen=True)
 class Settings:
@@ -242,8 +246,7 @@ class Optimisation:
     def problem(self) -> Problem:
         """The problem that `result` solves, in the time step that it was evaluated with."""
         best = self.result
-        stage = dataclasses.replace(self.settings.stages[best.stage], time_step=best.time_step)
-        return Problem(stage.scene(self.scene), stage.beta)
+        return self.settings.stages[best.stage].problem(self.scene, best.time_step)
 
     @property
     def failed_evaluations(self) -> int:

@@ -83,8 +83,7 @@ class RunFile:
     def problem(self, stage: int | None = None) -> Problem:
         """The problem that a stage solved, by default that of the best design."""
         index = self._stage(stage)
-        chosen = dataclasses.replace(self.settings.stages[index], time_step=self.time_steps[index])
-        return Problem(chosen.scene(self.scene), chosen.beta)
+        return self.settings.stages[index].problem(self.scene, self.time_steps[index])
 
     def _stage(self, stage: int | None) -> int:
         index = self.best_stage if stage is None else stage

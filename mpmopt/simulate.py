@@ -125,7 +125,6 @@ class Simulation:
         self.scene = scene
         self.particles = particles
         self.world = world_of(scene)
-        self.volume = particles.volume
         stress = [(S[0][0], S[0][1], S[1][1]) for S in (a.stress for a in scene.actuators)]
         self.body = mpm.Body(
             volume=particles.volume.astype(dtype),
@@ -334,7 +333,7 @@ class Forward:
         simulation, memory = self._simulation, self._memory
         schedule = self._checkpoints.schedule
         bar = seed.copy()
-        body_bar = mpm.BodyBar(*(np.zeros(bar.shape[1]) for _ in mpm.BodyBar._fields))
+        body_bar = mpm.BodyBar.zeros(bar.shape[1])
         signal_bar = np.zeros_like(simulation.signal)
         segments = schedule.segments
         for index in range(len(segments) - 1, -1, -1):
@@ -358,7 +357,7 @@ class Forward:
                     signal_bar[first:last],
                 )
         return Gradient(
-            density=simulation.volume * body_bar.mass,
+            density=simulation.particles.volume * body_bar.mass,
             lame_lambda=body_bar.lame_lambda,
             lame_mu=body_bar.lame_mu,
             signal=signal_bar,

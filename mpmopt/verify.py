@@ -152,7 +152,6 @@ class _Bench:
         self.state[8:12] = 0.2 * rng.uniform(-1.0, 1.0, (4, count))
         self.state[[8, 11]] += 1.0
         self.world = world_of(scene)
-        ones = np.ones(count)
         vary = rng.uniform(0.1, 1.0, count)
         sample = Simulation(
             scene,
@@ -187,7 +186,6 @@ class _Bench:
             "grid": grid[:, :3][grid[:, 2] > 0.0],
             "node_velocity": speed * rng.standard_normal((self.nodes, 2)),
         }
-        self._ones = ones
 
     def _scratch(self, dtype: type) -> mpm.Scratch:
         return mpm.Scratch.make(self.state.shape[1], self.nodes, dtype)
@@ -210,9 +208,6 @@ class _Bench:
         body = self.body._replace(**arrays)
         floats = ("volume", "mass", "lame_lambda", "lame_mu")
         return body._replace(**{name: getattr(body, name).astype(dtype) for name in floats})
-
-    def _body_bar(self) -> mpm.BodyBar:
-        return mpm.BodyBar(*(0.0 * self._ones for _ in mpm.BodyBar._fields))
 
     def deform(self, v: Arrays) -> Arrays:
         old = self._state(v, np.result_type(*v.values()).type)
@@ -244,7 +239,11 @@ class _Bench:
 
     def stress_adjoint(self, v: Arrays, w: Arrays) -> Arrays:
         state, scratch, body = self._state(v, float), self._scratch(float), self._body(v, float)
-        bar, body_bar, signal_bar = np.zeros_like(state), self._body_bar(), 0.0 * v["signal"]
+        bar, body_bar, signal_bar = (
+            np.zeros_like(state),
+            mpm.BodyBar.zeros(self.state.shape[1]),
+            0.0 * v["signal"],
+        )
         scratch.affine_bar[:] = w["affine"]
         given = (state, state, _log_jacobian(state), body, self.world, v["signal"])
         mpm.stress_adjoint(*given, scratch, bar, body_bar, signal_bar)
@@ -266,7 +265,7 @@ class _Bench:
         return {"grid": grid[:, :3]}
 
     def p2g_adjoint(self, v: Arrays, w: Arrays) -> Arrays:
-        scratch, body_bar = self._scratch(float), self._body_bar()
+        scratch, body_bar = self._scratch(float), mpm.BodyBar.zeros(self.state.shape[1])
         bar = np.zeros_like(self.state)
         scratch.affine[:] = v["affine"]
         scratch.node_bar[:, :3] = w["grid"]
