@@ -14,20 +14,29 @@ Every kernel is followed by its adjoint of the same name, which uses the same va
 ``_bar`` marks the derivative of the objective with respect to a variable. Branches (contact, cells)
 are those that the forward step took.
 
-A state is an array (12, N): x, y, u, v, C00, C01, C10, C11, F00, F01, F10, F11 of N particles.
-Grid arrays hold the window of nodes that the particles touch and no others: node (i, j) is record
-``(i - i0) nj + (j - j0)`` of window ``(i0, j0, ni, nj)``.
+Arrays hold records of four numbers, which a processor handles as one. Particles come in groups of
+four: records 12 g to 12 g + 11 of a state are x, y, u, v, C00, C01, C10, C11, F00, F01, F10, F11 of
+group g, and `grouped` makes them of an array (12, N). Grid arrays hold the window of nodes that
+the particles touch and no others: node (i, j) is record ``(i - i0) nj + (j - j0)`` of window
+``(i0, j0, ni, nj)``.
+
+Several threads share a step. Each has its blocks of groups, which put their momentum on nodes of
+their own, and its columns of the window, in which it adds the blocks up in their order. So results
+do not depend on the number of threads. What is derived of particles lives in a `Tile`.
 
 The kernels also compile for complex128, which makes the complex step an oracle for the adjoint:
 cells, walls and comparisons look at real parts only. They know arrays and numbers, no user objects,
-and they live in one file because Numba's disk cache does not see changes in another one. `load`,
-`store`, `pack` and `add_scaled` handle a node's record as one; they stand at the end of the file.
+and they live in one file because Numba's disk cache does not see changes in another one. What
+records can do (`load`, `store`, `spread`, `blend`, ...) stands at the end of the file.
 
 Sources: Hu et al. 2018 (MLS-MPM), Jiang et al. 2015 (APIC), Sato et al. 2023 (actuation).
 """
 
+import functools
+import math
 import operator
-from typing import Any, NamedTuple
+import sys
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from llvmlite import ir
@@ -37,7 +46,10 @@ from numba.extending import intrinsic, models, overload, register_model
 from numpy.typing import DTypeLike, NDArray
 
 STATE_SIZE = 12
-NODE_SIZE = 4  # one vector register: momentum and mass (q_x, q_y, m, 0), velocity (u, v, u, v)
+NODE_SIZE = 4  # one record: momentum and mass (q_x, q_y, m, 0)
+
+# Groups of four particles that are handled together, while what is derived of them is at hand.
+TILE = 16
 
 # How `advance` ended.
 DONE, WINDOW_TOO_SMALL, ESCAPED, INVERTED = 0, 1, 2, 3
@@ -73,60 +85,94 @@ class World(NamedTuple):
 
 
 class Body(NamedTuple):
-    """Constants of N particles and of K actuators; arrays may be complex for the complex step."""
+    """Constants of G groups of four particles and of K actuators; complex for the complex step."""
 
-    volume: NDArray  # (N,) reference volume
-    mass: NDArray  # (N,)
-    lame_lambda: NDArray  # (N,)
-    lame_mu: NDArray  # (N,)
-    actuator: NDArray[np.int64]  # (N,) index of the actuator, -1: none
+    volume: NDArray  # (G, 4) reference volume
+    mass: NDArray  # (G, 4)
+    lame_lambda: NDArray  # (G, 4)
+    lame_mu: NDArray  # (G, 4)
+    active: NDArray[np.bool_]  # (G,) whether a group has actuated particles
+    actuated: NDArray[np.float64]  # (K, G, 4) 1 for the particles of actuator k, else 0
     actuation_stress: NDArray[np.float64]  # (K, 3) second Piola-Kirchhoff S: xx, xy, yy
+    first: NDArray[np.int64]  # (B + 1,) first group of each of B blocks, and G
 
 
 class BodyBar(NamedTuple):
     """Adjoints of `Body`, accumulated over the steps."""
 
-    mass: NDArray  # (N,)
-    lame_lambda: NDArray  # (N,)
-    lame_mu: NDArray  # (N,)
+    mass: NDArray  # (G, 4)
+    lame_lambda: NDArray  # (G, 4)
+    lame_mu: NDArray  # (G, 4)
 
     @classmethod
-    def zeros(cls, particles: int) -> "BodyBar":
-        """Nothing accumulated yet, for so many particles."""
-        return cls(*(np.zeros(particles) for _ in cls._fields))
+    def zeros(cls, groups: int) -> "BodyBar":
+        """Nothing accumulated yet."""
+        return cls(*(np.zeros((groups, 4)) for _ in cls._fields))
+
+
+class Tile(NamedTuple):
+    """What a step derives of some groups of particles at a time: small, to stay in fast memory.
+
+    Arrays of records, so many for each of T groups.
+    """
+
+    base: NDArray[np.float64]  # (2 T, 4) first of the three nodes along x and y
+    spline: NDArray  # (24 T, 4) by threes: w and w r along x and y; r and s of x, of y
+    affine: NDArray  # (4 T, 4) A, the affine momentum
+    gathered: (
+        NDArray  # (8 T, 4) A_bar; sums over nodes of w q_bar and grad(w) times what it weights
+    )
+    mass_bar: NDArray  # (T, 4) sum over nodes of w m_bar
+
+
+@jit
+def make_tile(groups, like):
+    """Room for so many groups, of the type of the array `like`."""
+    zero = 0.0 * like.flat[0]
+    return Tile(
+        np.zeros((2 * groups, 4)),
+        np.full((24 * groups, 4), zero),
+        np.full((4 * groups, 4), zero),
+        np.full((8 * groups, 4), zero),
+        np.full((groups, 4), zero),
+    )
 
 
 class Scratch(NamedTuple):
-    """Arrays that live for one step, for N particles and a window of M nodes."""
+    """What the threads share during a step, for B blocks and a window of M nodes."""
 
-    affine: NDArray  # (4, N) A, the affine momentum
-    velocity: NDArray  # (M, 4) u
-    affine_bar: NDArray  # (4, N)
+    velocity: NDArray  # (M, 4) u, of which two numbers are used
     velocity_bar: NDArray  # (M, 4)
     node_bar: NDArray  # (M, 4) adjoints of momentum and mass
+    parts: NDArray  # (B, P, 4) what each block puts on the nodes of its own window
+    ends: NDArray[np.int64]  # (B, 2) how the step ended for each block, and a particle
+    meeting: NDArray[np.int64]  # (16,) where threads meet
 
     @classmethod
-    def make(cls, particles: int, nodes: int, dtype: DTypeLike = float) -> "Scratch":
-        """Room for so many particles and nodes."""
-        affine, node = (4, particles), (nodes, NODE_SIZE)
-        return cls(*(np.zeros(shape, dtype) for shape in (affine, node, affine, node, node)))
+    def make(cls, nodes: int, blocks: int, part: int, dtype: DTypeLike = float) -> "Scratch":
+        """Room for so many nodes, blocks, and nodes of a block."""
+        node, parts = (nodes, NODE_SIZE), (blocks, part, NODE_SIZE)
+        velocity, velocity_bar, node_bar = (np.zeros(node, dtype) for _ in range(3))
+        ends, meeting = np.zeros((blocks, 2), np.int64), np.zeros(16, np.int64)
+        return cls(velocity, velocity_bar, node_bar, np.zeros(parts, dtype), ends, meeting)
 
 
 @jit
-def weights(x, dx):
-    """Base node, quadratic B-spline weights of it and the next two nodes, and their distances."""
-    base = int(x.real / dx - 0.5)
-    f = x / dx - base
-    w = (0.5 * (1.5 - f) ** 2, 0.75 - (f - 1.0) ** 2, 0.5 * (f - 0.5) ** 2)
-    d = (-f * dx, (1.0 - f) * dx, (2.0 - f) * dx)
-    return base, w, d
+def weights(f):
+    """Quadratic B-spline weights of three nodes; a particle is f cells from the first of them."""
+    return 0.5 * (1.5 - f) * (1.5 - f), 0.75 - (f - 1.0) * (f - 1.0), 0.5 * (f - 0.5) * (f - 0.5)
 
 
 @jit
-def weight_slopes(x, dx):
-    """Derivatives of the three weights with respect to x."""
-    f = x / dx - int(x.real / dx - 0.5)
-    return ((f - 1.5) / dx, -2.0 * (f - 1.0) / dx, (f - 0.5) / dx)
+def weight_slopes(f, dx):
+    """Derivatives of the three weights with respect to the position."""
+    return (f - 1.5) / dx, (2.0 - 2.0 * f) / dx, (f - 0.5) / dx
+
+
+@jit
+def distances(f, dx):
+    """From the particle to the three nodes."""
+    return (0.0 - f) * dx, (1.0 - f) * dx, (2.0 - f) * dx
 
 
 @jit
@@ -135,8 +181,8 @@ def interpolation(position, dx, rows):
     nodes = np.empty((position.shape[0], 9), np.int64)
     values = np.empty((position.shape[0], 9))
     for p in range(position.shape[0]):
-        i, wx, _ = weights(position[p, 0], dx)
-        j, wy, _ = weights(position[p, 1], dx)
+        i, j = int(position[p, 0] / dx - 0.5), int(position[p, 1] / dx - 0.5)
+        wx, wy = weights(position[p, 0] / dx - i), weights(position[p, 1] / dx - j)
         for a in range(3):
             for b in range(3):
                 nodes[p, 3 * a + b] = (i + a) * rows + j + b
@@ -145,232 +191,325 @@ def interpolation(position, dx, rows):
 
 
 @jit
-def find_window(state, world):
-    """Window (i0, j0, ni, nj) of all touched nodes, and the first particle off the grid or -1."""
-    lo = 0.5 * world.dx
-    hi_x = (world.nodes_x - 1.5) * world.dx
-    hi_y = (world.nodes_y - 1.5) * world.dx
+def find_window(state, world, first, last):
+    """Window (i0, j0, ni, nj) of the nodes that particles touch; whether all are on the grid."""
+    dx = world.dx
+    lo = spread(0.5 * dx)
+    hi_x, hi_y = spread((world.nodes_x - 1.5) * dx), spread((world.nodes_y - 1.5) * dx)
     x_min, x_max, y_min, y_max = hi_x, lo, hi_y, lo
-    for p in range(state.shape[1]):
-        x = state[0, p].real
-        y = state[1, p].real
-        if not (lo <= x < hi_x and lo <= y < hi_y):
-            return 0, 0, 0, 0, p
-        x_min = min(x_min, x)
-        x_max = max(x_max, x)
-        y_min = min(y_min, y)
-        y_max = max(y_max, y)
-    i0 = int(x_min / world.dx - 0.5)
-    j0 = int(y_min / world.dx - 0.5)
-    ni = int(x_max / world.dx - 0.5) + 3 - i0
-    nj = int(y_max / world.dx - 0.5) + 3 - j0
-    # Nodes across a mirror need their images.
+    for g in range(first, last):
+        x, y = real(load(state, 12 * g)), real(load(state, 12 * g + 1))
+        if not (within(x, lo, hi_x) and within(y, lo, hi_y)):
+            return 0, 0, 0, 0, False
+        x_min, x_max = least(x_min, x), greatest(x_max, x)
+        y_min, y_max = least(y_min, y), greatest(y_max, y)
+    x0, x1, y0, y1 = x_min[0], x_max[0], y_min[0], y_max[0]
+    for k in range(1, 4):
+        x0, x1, y0, y1 = min(x0, x_min[k]), max(x1, x_max[k]), min(y0, y_min[k]), max(y1, y_max[k])
+    i0, j0 = int(x0 / dx - 0.5), int(y0 / dx - 0.5)
+    return i0, j0, int(x1 / dx - 0.5) + 3 - i0, int(y1 / dx - 0.5) + 3 - j0, True
+
+
+@jit
+def locate(state, world, tile, first, last):
+    """Base nodes of the particles, and their weights w and w r along x and y, into the tile."""
+    dx = world.dx
+    for g in range(first, last):
+        t = g - first
+        x, y = load(state, 12 * g) / dx, load(state, 12 * g + 1) / dx
+        i, j = whole(real(x) - 0.5), whole(real(y) - 0.5)
+        store(tile.base, 2 * t, i)
+        store(tile.base, 2 * t + 1, j)
+        w_x, r_x = weights(x - i), distances(x - i, dx)
+        w_y, r_y = weights(y - j), distances(y - j, dx)
+        for a in range(3):
+            store(tile.spline, 24 * t + a, w_x[a])
+            store(tile.spline, 24 * t + 3 + a, w_x[a] * r_x[a])
+            store(tile.spline, 24 * t + 6 + a, w_y[a])
+            store(tile.spline, 24 * t + 9 + a, w_y[a] * r_y[a])
+
+
+@jit
+def locate_adjoint(state, world, tile, first, last):
+    """After `locate`: distances r and the weights' slopes s along x and y, into the tile."""
+    dx = world.dx
+    for g in range(first, last):
+        t = g - first
+        fx = load(state, 12 * g) / dx - load(tile.base, 2 * t)
+        fy = load(state, 12 * g + 1) / dx - load(tile.base, 2 * t + 1)
+        s_x, r_x = weight_slopes(fx, dx), distances(fx, dx)
+        s_y, r_y = weight_slopes(fy, dx), distances(fy, dx)
+        for a in range(3):
+            store(tile.spline, 24 * t + 12 + a, r_x[a])
+            store(tile.spline, 24 * t + 15 + a, s_x[a])
+            store(tile.spline, 24 * t + 18 + a, r_y[a])
+            store(tile.spline, 24 * t + 21 + a, s_y[a])
+
+
+@jit
+def whole_window(windows, world):
+    """Window (i0, j0, ni, nj) that holds those of all blocks (B, 4), and their mirror images."""
+    i0, j0, i1, j1 = world.nodes_x, world.nodes_y, 0, 0
+    for b in range(windows.shape[0]):
+        i0 = min(i0, windows[b, 0])
+        j0 = min(j0, windows[b, 1])
+        i1 = max(i1, windows[b, 0] + windows[b, 2])
+        j1 = max(j1, windows[b, 1] + windows[b, 3])
     if world.mirror_axis == 0:
-        extra = max(0, i0 + (i0 + ni - 1) - 2 * world.mirror_node)
-        i0, ni = i0 - extra, ni + extra
+        i0 = min(i0, 2 * world.mirror_node - (i1 - 1))
     elif world.mirror_axis == 1:
-        extra = max(0, j0 + (j0 + nj - 1) - 2 * world.mirror_node)
-        j0, nj = j0 - extra, nj + extra
-    return i0, j0, ni, nj, -1
+        j0 = min(j0, 2 * world.mirror_node - (j1 - 1))
+    return i0, j0, i1 - i0, j1 - j0
 
 
 @jit
-def deform(old, new, world, log_J):
-    """F' into the new state and ln J'; returns the first inverted particle or -1."""
+def deform(old, new, world, log_J, first, last):
+    """F' into the new state and ln J'; returns whether no particle is inverted."""
     dt = world.dt
-    C, F, G = old[4:8], old[8:12], new[8:12]
-    inverted = -1
-    for p in range(old.shape[1]):
-        c00, c01, c10, c11 = C[0, p], C[1, p], C[2, p], C[3, p]
-        f00 = F[0, p] + dt * (c00 * F[0, p] + c01 * F[2, p])
-        f01 = F[1, p] + dt * (c00 * F[1, p] + c01 * F[3, p])
-        f10 = F[2, p] + dt * (c10 * F[0, p] + c11 * F[2, p])
-        f11 = F[3, p] + dt * (c10 * F[1, p] + c11 * F[3, p])
-        J = f00 * f11 - f01 * f10
-        if not J.real > 0.0 and inverted < 0:
-            inverted = p
-        G[0, p], G[1, p], G[2, p], G[3, p] = f00, f01, f10, f11
-        log_J[p] = np.log(J)
-    return inverted
+    upright = True
+    for g in range(first, last):
+        c00, c01, c10, c11 = tensor(old, 12 * g + 4)
+        f00, f01, f10, f11 = tensor(old, 12 * g + 8)
+        g00 = f00 + dt * (c00 * f00 + c01 * f10)
+        g01 = f01 + dt * (c00 * f01 + c01 * f11)
+        g10 = f10 + dt * (c10 * f00 + c11 * f10)
+        g11 = f11 + dt * (c10 * f01 + c11 * f11)
+        J = g00 * g11 - g01 * g10
+        upright &= positive(J)
+        store_tensor(new, 12 * g + 8, g00, g01, g10, g11)
+        store(log_J, g, logarithm(J))
+    return upright
 
 
 @jit
-def deform_adjoint(old, world, bar):
+def deform_adjoint(old, world, bar, first, last):
     """From F_bar' to F_bar, in place; adds to C_bar."""
     dt = world.dt
-    C, F, C_bar, F_bar = old[4:8], old[8:12], bar[4:8], bar[8:12]
-    for p in range(old.shape[1]):
-        c00, c01, c10, c11 = C[0, p], C[1, p], C[2, p], C[3, p]
-        f00, f01, f10, f11 = F[0, p], F[1, p], F[2, p], F[3, p]
-        b00, b01, b10, b11 = F_bar[0, p], F_bar[1, p], F_bar[2, p], F_bar[3, p]
-        C_bar[0, p] += dt * (b00 * f00 + b01 * f01)
-        C_bar[1, p] += dt * (b00 * f10 + b01 * f11)
-        C_bar[2, p] += dt * (b10 * f00 + b11 * f01)
-        C_bar[3, p] += dt * (b10 * f10 + b11 * f11)
-        F_bar[0, p] = b00 + dt * (c00 * b00 + c10 * b10)
-        F_bar[1, p] = b01 + dt * (c00 * b01 + c10 * b11)
-        F_bar[2, p] = b10 + dt * (c01 * b00 + c11 * b10)
-        F_bar[3, p] = b11 + dt * (c01 * b01 + c11 * b11)
+    for g in range(first, last):
+        c00, c01, c10, c11 = tensor(old, 12 * g + 4)
+        f00, f01, f10, f11 = tensor(old, 12 * g + 8)
+        d00, d01, d10, d11 = tensor(bar, 12 * g + 4)
+        b00, b01, b10, b11 = tensor(bar, 12 * g + 8)
+        store_tensor(
+            bar,
+            12 * g + 4,
+            d00 + dt * (b00 * f00 + b01 * f01),
+            d01 + dt * (b00 * f10 + b01 * f11),
+            d10 + dt * (b10 * f00 + b11 * f01),
+            d11 + dt * (b10 * f10 + b11 * f11),
+        )
+        store_tensor(
+            bar,
+            12 * g + 8,
+            b00 + dt * (c00 * b00 + c10 * b10),
+            b01 + dt * (c00 * b01 + c10 * b11),
+            b10 + dt * (c01 * b00 + c11 * b10),
+            b11 + dt * (c01 * b01 + c11 * b11),
+        )
 
 
 @jit
-def stress(old, new, log_J, body, world, signal, scratch):
+def stress(old, new, log_J, body, world, signal, tile, first, last):
     """Affine momentum A from C, F' and ln J'."""
-    C, F = old[4:8], new[8:12]
-    for p in range(old.shape[1]):
-        f00, f01, f10, f11 = F[0, p], F[1, p], F[2, p], F[3, p]
-        mu = body.lame_mu[p]
-        spherical = body.lame_lambda[p] * log_J[p] - mu
+    for g in range(first, last):
+        c00, c01, c10, c11 = tensor(old, 12 * g + 4)
+        f00, f01, f10, f11 = tensor(new, 12 * g + 8)
+        m, mu = load(body.mass, g), load(body.lame_mu, g)
+        spherical = load(body.lame_lambda, g) * load(log_J, g) - mu
         t00 = mu * (f00 * f00 + f01 * f01) + spherical
         t01 = mu * (f00 * f10 + f01 * f11)
         t11 = mu * (f10 * f10 + f11 * f11) + spherical
-        k = body.actuator[p]
-        if k >= 0:
-            s = signal[k]
-            s00 = s * body.actuation_stress[k, 0]
-            s01 = s * body.actuation_stress[k, 1]
-            s11 = s * body.actuation_stress[k, 2]
-            t00 += f00 * (s00 * f00 + s01 * f01) + f01 * (s01 * f00 + s11 * f01)
-            t01 += f00 * (s00 * f10 + s01 * f11) + f01 * (s01 * f10 + s11 * f11)
-            t11 += f10 * (s00 * f10 + s01 * f11) + f11 * (s01 * f10 + s11 * f11)
-        m = body.mass[p]
-        impulse = world.dt * body.volume[p] * 4.0 / world.dx**2
-        scratch.affine[0, p] = m * C[0, p] - impulse * t00
-        scratch.affine[1, p] = m * C[1, p] - impulse * t01
-        scratch.affine[2, p] = m * C[2, p] - impulse * t01
-        scratch.affine[3, p] = m * C[3, p] - impulse * t11
+        if body.active[g]:
+            s00, s01, s11 = actuation(body, g, signal)
+            t00 = t00 + f00 * (s00 * f00 + s01 * f01) + f01 * (s01 * f00 + s11 * f01)
+            t01 = t01 + f00 * (s00 * f10 + s01 * f11) + f01 * (s01 * f10 + s11 * f11)
+            t11 = t11 + f10 * (s00 * f10 + s01 * f11) + f11 * (s01 * f10 + s11 * f11)
+        impulse = world.dt * (4.0 / world.dx**2) * load(body.volume, g)
+        store_tensor(
+            tile.affine,
+            4 * (g - first),
+            m * c00 - impulse * t00,
+            m * c01 - impulse * t01,
+            m * c10 - impulse * t01,
+            m * c11 - impulse * t11,
+        )
 
 
 @jit
-def stress_adjoint(old, new, log_J, body, world, signal, scratch, bar, body_bar, signal_bar):
+def actuation(body, g, signal):
+    """s S of the actuators of four particles: xx, xy, yy."""
+    s00 = s01 = s11 = spread(0.0 * body.mass[g, 0])
+    for k in range(signal.size):
+        there = load(body.actuated[k], g)
+        s00 = s00 + signal[k] * body.actuation_stress[k, 0] * there
+        s01 = s01 + signal[k] * body.actuation_stress[k, 1] * there
+        s11 = s11 + signal[k] * body.actuation_stress[k, 2] * there
+    return s00, s01, s11
+
+
+@jit
+def stress_adjoint(
+    old, new, log_J, body, world, signal, tile, bar, body_bar, signal_bar, first, last
+):
     """From A_bar to C_bar; adds to F_bar' and to the adjoints of the material and the signal."""
-    C, F, A_bar = old[4:8], new[8:12], scratch.affine_bar
-    C_bar, F_bar = bar[4:8], bar[8:12]
-    for p in range(old.shape[1]):
-        f00, f01, f10, f11 = F[0, p], F[1, p], F[2, p], F[3, p]
-        a00, a01, a10, a11 = A_bar[0, p], A_bar[1, p], A_bar[2, p], A_bar[3, p]
-        m = body.mass[p]
-        C_bar[0, p], C_bar[1, p], C_bar[2, p], C_bar[3, p] = m * a00, m * a01, m * a10, m * a11
-        body_bar.mass[p] += a00 * C[0, p] + a01 * C[1, p] + a10 * C[2, p] + a11 * C[3, p]
+    for g in range(first, last):
+        c00, c01, c10, c11 = tensor(old, 12 * g + 4)
+        f00, f01, f10, f11 = tensor(new, 12 * g + 8)
+        a00, a01, a10, a11 = tensor(tile.gathered, 8 * (g - first))
+        m, mu = load(body.mass, g), load(body.lame_mu, g)
+        store_tensor(bar, 12 * g + 4, m * a00, m * a01, m * a10, m * a11)
+        add(body_bar.mass, g, a00 * c00 + a01 * c01 + a10 * c10 + a11 * c11)
 
         # T = tau_bar; tau is symmetric, and t01 gathers both of its places in A.
-        impulse = -world.dt * body.volume[p] * 4.0 / world.dx**2
+        impulse = -world.dt * (4.0 / world.dx**2) * load(body.volume, g)
         t00, t01, t11 = impulse * a00, impulse * (a01 + a10), impulse * a11
-        mu = body.lame_mu[p]
         trace = t00 + t11
-        body_bar.lame_mu[p] += (
-            t00 * (f00 * f00 + f01 * f01)
-            + t01 * (f00 * f10 + f01 * f11)
-            + t11 * (f10 * f10 + f11 * f11)
-            - trace
+        stretch = t00 * (f00 * f00 + f01 * f01)
+        stretch = stretch + t01 * (f00 * f10 + f01 * f11)
+        stretch = stretch + t11 * (f10 * f10 + f11 * f11)
+        add(body_bar.lame_mu, g, stretch - trace)
+        add(body_bar.lame_lambda, g, trace * load(log_J, g))
+
+        # F_bar' += (T + T^T) F' (mu I + s S) + lambda tr T F'^-T
+        pressure = load(body.lame_lambda, g) * trace / (f00 * f11 - f01 * f10)
+        h00, h01, h10, h11 = mu * f00, mu * f01, mu * f10, mu * f11
+        if body.active[g]:
+            s00, s01, s11 = actuation(body, g, signal)
+            h00, h01 = h00 + f00 * s00 + f01 * s01, h01 + f00 * s01 + f01 * s11
+            h10, h11 = h10 + f10 * s00 + f11 * s01, h11 + f10 * s01 + f11 * s11
+            for k in range(signal.size):
+                there = load(body.actuated[k], g)
+                s00 = body.actuation_stress[k, 0]
+                s01 = body.actuation_stress[k, 1]
+                s11 = body.actuation_stress[k, 2]
+                g00, g01 = s00 * f00 + s01 * f01, s01 * f00 + s11 * f01  # F' S
+                g10, g11 = s00 * f10 + s01 * f11, s01 * f10 + s11 * f11
+                power = t00 * (g00 * f00 + g01 * f01)
+                power = power + t01 * (g00 * f10 + g01 * f11)
+                power = power + t11 * (g10 * f10 + g11 * f11)
+                signal_bar[k] += total(there * power)
+        b00, b01, b10, b11 = tensor(bar, 12 * g + 8)
+        store_tensor(
+            bar,
+            12 * g + 8,
+            b00 + 2.0 * t00 * h00 + t01 * h10 + pressure * f11,
+            b01 + 2.0 * t00 * h01 + t01 * h11 - pressure * f10,
+            b10 + t01 * h00 + 2.0 * t11 * h10 - pressure * f01,
+            b11 + t01 * h01 + 2.0 * t11 * h11 + pressure * f00,
         )
-        body_bar.lame_lambda[p] += trace * log_J[p]
-
-        # F_bar' += mu (T + T^T) F' + lambda tr T F'^-T
-        p00, p01, p11 = 2.0 * mu * t00, mu * t01, 2.0 * mu * t11
-        pressure = body.lame_lambda[p] * trace / (f00 * f11 - f01 * f10)
-        b00 = p00 * f00 + p01 * f10 + pressure * f11
-        b01 = p00 * f01 + p01 * f11 - pressure * f10
-        b10 = p01 * f00 + p11 * f10 - pressure * f01
-        b11 = p01 * f01 + p11 * f11 + pressure * f00
-        k = body.actuator[p]
-        if k >= 0:
-            s00 = body.actuation_stress[k, 0]
-            s01 = body.actuation_stress[k, 1]
-            s11 = body.actuation_stress[k, 2]
-            g00, g01 = f00 * s00 + f01 * s01, f00 * s01 + f01 * s11  # F' S
-            g10, g11 = f10 * s00 + f11 * s01, f10 * s01 + f11 * s11
-            signal_bar[k] += (
-                t00 * (g00 * f00 + g01 * f01)
-                + t01 * (g00 * f10 + g01 * f11)
-                + t11 * (g10 * f10 + g11 * f11)
-            )
-            s = signal[k]
-            b00 += s * (2.0 * t00 * g00 + t01 * g10)
-            b01 += s * (2.0 * t00 * g01 + t01 * g11)
-            b10 += s * (t01 * g00 + 2.0 * t11 * g10)
-            b11 += s * (t01 * g01 + 2.0 * t11 * g11)
-        F_bar[0, p] += b00
-        F_bar[1, p] += b01
-        F_bar[2, p] += b10
-        F_bar[3, p] += b11
 
 
 @jit
-def p2g(state, body, world, scratch, window, grid):
-    """Particle to grid: momentum and mass of the window's nodes."""
-    i0, j0, ni, nj = window
-    x, v, A = state[0:2], state[2:4], scratch.affine
-    grid[: ni * nj] = 0.0
-    for p in range(state.shape[1]):
-        i, wx, rx = weights(x[0, p], world.dx)
-        j, wy, ry = weights(x[1, p], world.dx)
-        m = body.mass[p]
-        qx, qy = m * v[0, p], m * v[1, p]
-        a00, a01, a10, a11 = A[0, p], A[1, p], A[2, p], A[3, p]
-        down = pack(grid, a01, a11, 0.0, 0.0)
-        for a in range(3):
-            node = (i - i0 + a) * nj + j - j0
-            row = pack(grid, qx + a00 * rx[a], qy + a10 * rx[a], m, 0.0)
-            for b in range(3):
-                w = wx[a] * wy[b]
-                momentum = add_scaled(ry[b], down, row)
-                store(grid, node + b, add_scaled(w, momentum, load(grid, node + b)))
+def spreads(tile, row, k):
+    """Three numbers of particle k of four as records: from a record of the tile's splines on."""
+    w0, w1 = number(tile.spline, row, k), number(tile.spline, row + 1, k)
+    return spread(w0), spread(w1), spread(number(tile.spline, row + 2, k))
 
 
 @jit
-def p2g_adjoint(state, body, world, scratch, window, bar, body_bar):
+def blends(x, y):
+    """First halves of three records and second halves of three others."""
+    return blend(x[0], y[0]), blend(x[1], y[1]), blend(x[2], y[2])
+
+
+@jit
+def p2g(state, body, world, tile, window, grid, first, last):
+    """Particle to grid: momentum and mass (q_x, q_y, m, 0) of the window's nodes."""
+    i0, j0, _, nj = window
+    for g in range(first, last):
+        t = g - first
+        for k in range(4):
+            i, j = number(tile.base, 2 * t, k), number(tile.base, 2 * t + 1, k)
+            node = (int(i) - i0) * nj + int(j) - j0
+            w_x, wr_x = spreads(tile, 24 * t, k), spreads(tile, 24 * t + 3, k)
+            w_y, wr_y = spreads(tile, 24 * t + 6, k), spreads(tile, 24 * t + 9, k)
+            m = number(body.mass, g, k)
+            zero = 0.0 * m
+            A, row = tile.affine, 4 * t
+            q = pack(m * number(state, 12 * g + 2, k), m * number(state, 12 * g + 3, k), m, zero)
+            a0 = pack(number(A, row, k), number(A, row + 2, k), zero, zero)
+            a1 = pack(number(A, row + 1, k), number(A, row + 3, k), zero, zero)
+            p2g_row(grid, node, w_x[0] * q + wr_x[0] * a0, w_x[0] * a1, w_y, wr_y)
+            p2g_row(grid, node + nj, w_x[1] * q + wr_x[1] * a0, w_x[1] * a1, w_y, wr_y)
+            p2g_row(grid, node + 2 * nj, w_x[2] * q + wr_x[2] * a0, w_x[2] * a1, w_y, wr_y)
+
+
+@jit
+def p2g_row(grid, n, q, a1, w, wr):
+    """Add w q + w r a1 to three nodes in a row."""
+    add(grid, n, w[0] * q + wr[0] * a1)
+    add(grid, n + 1, w[1] * q + wr[1] * a1)
+    add(grid, n + 2, w[2] * q + wr[2] * a1)
+
+
+@jit
+def p2g_adjoint(state, body, world, tile, scratch, window, bar, body_bar, first, last):
     """From momentum_bar and mass_bar of nodes to v_bar, A_bar, x_bar and mass_bar of particles."""
     i0, j0, _, nj = window
-    x, v, A = state[0:2], state[2:4], scratch.affine
-    x_bar, v_bar, A_bar = bar[0:2], bar[2:4], scratch.affine_bar
-    grid_bar = scratch.node_bar
-    for p in range(state.shape[1]):
-        i, wx, rx = weights(x[0, p], world.dx)
-        j, wy, ry = weights(x[1, p], world.dx)
-        slope_x = weight_slopes(x[0, p], world.dx)
-        slope_y = weight_slopes(x[1, p], world.dx)
-        m = body.mass[p]
-        qx, qy = m * v[0, p], m * v[1, p]
-        a00, a01, a10, a11 = A[0, p], A[1, p], A[2, p], A[3, p]
-        # Sums over the nodes, named by their weights along x and y: the weight w, its slope s, each
-        # perhaps times the distance r. Lanes: adjoints of q_x, q_y and m.
-        ww = wr_w = w_wr = s_w = sr_w = s_wr = w_s = wr_s = w_sr = zero(grid_bar)
-        for a in range(3):
-            node = (i - i0 + a) * nj + j - j0
-            row_w = row_wr = row_s = row_sr = zero(grid_bar)
-            for b in range(3):
-                record = load(grid_bar, node + b)
-                row_w = add_scaled(wy[b], record, row_w)
-                row_wr = add_scaled(wy[b] * ry[b], record, row_wr)
-                row_s = add_scaled(slope_y[b], record, row_s)
-                row_sr = add_scaled(slope_y[b] * ry[b], record, row_sr)
-            w, r, s = wx[a], rx[a], slope_x[a]
-            ww = add_scaled(w, row_w, ww)
-            wr_w = add_scaled(w * r, row_w, wr_w)
-            w_wr = add_scaled(w, row_wr, w_wr)
-            s_w = add_scaled(s, row_w, s_w)
-            sr_w = add_scaled(s * r, row_w, sr_w)
-            s_wr = add_scaled(s, row_wr, s_wr)
-            w_s = add_scaled(w, row_s, w_s)
-            wr_s = add_scaled(w * r, row_s, wr_s)
-            w_sr = add_scaled(w, row_sr, w_sr)
-        x_bar[0, p] += (
-            (qx * s_w[0] + a00 * sr_w[0] + a01 * s_wr[0])
-            + (qy * s_w[1] + a10 * sr_w[1] + a11 * s_wr[1])
-            + m * s_w[2]
-            - (a00 * ww[0] + a10 * ww[1])
-        )
-        x_bar[1, p] += (
-            (qx * w_s[0] + a00 * wr_s[0] + a01 * w_sr[0])
-            + (qy * w_s[1] + a10 * wr_s[1] + a11 * w_sr[1])
-            + m * w_s[2]
-            - (a01 * ww[0] + a11 * ww[1])
-        )
-        v_bar[0, p] = m * ww[0]
-        v_bar[1, p] = m * ww[1]
-        A_bar[0, p], A_bar[1, p], A_bar[2, p], A_bar[3, p] = wr_w[0], w_wr[0], wr_w[1], w_wr[1]
-        body_bar.mass[p] += ww[2] + v[0, p] * ww[0] + v[1, p] * ww[1]
+    nodes, A, gathered = scratch.node_bar, tile.affine, tile.gathered
+    for g in range(first, last):
+        t = g - first
+        for k in range(4):
+            i, j = number(tile.base, 2 * t, k), number(tile.base, 2 * t + 1, k)
+            node = (int(i) - i0) * nj + int(j) - j0
+            w_x, wr_x = spreads(tile, 24 * t, k), spreads(tile, 24 * t + 3, k)
+            w_y, wr_y = spreads(tile, 24 * t + 6, k), spreads(tile, 24 * t + 9, k)
+            r_x, s_x = spreads(tile, 24 * t + 12, k), spreads(tile, 24 * t + 15, k)
+            r_y, s_y = spreads(tile, 24 * t + 18, k), spreads(tile, 24 * t + 21, k)
+            w_wr, w_s, s_w = blends(w_y, wr_y), blends(w_y, s_y), blends(s_x, w_x)
+            m = number(body.mass, g, k)
+            q = pair(m * number(state, 12 * g + 2, k), m * number(state, 12 * g + 3, k))
+            a0 = pair(number(A, 4 * t, k), number(A, 4 * t + 2, k))
+            a1 = pair(number(A, 4 * t + 1, k), number(A, 4 * t + 3, k))
+            mean_0, slope_0, mass_0 = p2g_adjoint_row(
+                nodes, node, q + r_x[0] * a0, a1, r_y, w_wr, w_s
+            )
+            mean_1, slope_1, mass_1 = p2g_adjoint_row(
+                nodes, node + nj, q + r_x[1] * a0, a1, r_y, w_wr, w_s
+            )
+            mean_2, slope_2, mass_2 = p2g_adjoint_row(
+                nodes, node + 2 * nj, q + r_x[2] * a0, a1, r_y, w_wr, w_s
+            )
+            mean = w_x[0] * mean_0 + w_x[1] * mean_1 + w_x[2] * mean_2
+            along = wr_x[0] * mean_0 + wr_x[1] * mean_1 + wr_x[2] * mean_2
+            slope = s_w[0] * slope_0 + s_w[1] * slope_1 + s_w[2] * slope_2
+            # Lanes of w_s m_bar: (w, w, s, s), and along x: (s, w, w, w).
+            mass = blend(alternate(s_x[0], w_x[0]), w_x[0]) * mass_0
+            mass = mass + blend(alternate(s_x[1], w_x[1]), w_x[1]) * mass_1
+            mass = mass + blend(alternate(s_x[2], w_x[2]), w_x[2]) * mass_2
+            set_number(gathered, 8 * t, k, along[0])
+            set_number(gathered, 8 * t + 1, k, mean[2])
+            set_number(gathered, 8 * t + 2, k, along[1])
+            set_number(gathered, 8 * t + 3, k, mean[3])
+            set_number(gathered, 8 * t + 4, k, mean[0])
+            set_number(gathered, 8 * t + 5, k, mean[1])
+            set_number(gathered, 8 * t + 6, k, slope[0] + slope[1] + m * mass[0])
+            set_number(gathered, 8 * t + 7, k, slope[2] + slope[3] + m * mass[2])
+            set_number(tile.mass_bar, t, k, mass[1])
+        a00, a01, a10, a11 = tensor(A, 4 * t)
+        qx_bar, qy_bar = load(gathered, 8 * t + 4), load(gathered, 8 * t + 5)
+        add(bar, 12 * g, load(gathered, 8 * t + 6) - a00 * qx_bar - a10 * qy_bar)
+        add(bar, 12 * g + 1, load(gathered, 8 * t + 7) - a01 * qx_bar - a11 * qy_bar)
+        m, u, v = load(body.mass, g), load(state, 12 * g + 2), load(state, 12 * g + 3)
+        store(bar, 12 * g + 2, m * qx_bar)
+        store(bar, 12 * g + 3, m * qy_bar)
+        add(body_bar.mass, g, load(tile.mass_bar, t) + u * qx_bar + v * qy_bar)
+
+
+@jit
+def p2g_adjoint_row(nodes, n, q, a1, r, w_wr, w_s):
+    """Sums over three nodes in a row: w q_bar and w r q_bar; w, s times q_bar.(q + a1 r); m_bar."""
+    q_bar, m_bar = load_pair(nodes, n), spread(number(nodes, n, 2))
+    mean, slope, mass = w_wr[0] * q_bar, w_s[0] * ((q + r[0] * a1) * q_bar), w_s[0] * m_bar
+    q_bar, m_bar = load_pair(nodes, n + 1), spread(number(nodes, n + 1, 2))
+    mean = mean + w_wr[1] * q_bar
+    slope = slope + w_s[1] * ((q + r[1] * a1) * q_bar)
+    mass = mass + w_s[1] * m_bar
+    q_bar, m_bar = load_pair(nodes, n + 2), spread(number(nodes, n + 2, 2))
+    mean = mean + w_wr[2] * q_bar
+    slope = slope + w_s[2] * ((q + r[2] * a1) * q_bar)
+    mass = mass + w_s[2] * m_bar
+    return mean, slope, mass
 
 
 @jit
@@ -450,224 +589,451 @@ def wall_adjoint(i, j, u, v, world, u_bar, v_bar):
 
 
 @jit
-def grid_update(grid, window, world, scratch):
-    """Velocity of the nodes from momentum, gravity and walls; zero where there is no mass."""
-    i0, j0, ni, nj = window
-    for a in range(ni):
-        for b in range(nj):
-            node = a * nj + b
-            m = grid[node, 2]
-            if m.real > 0.0:
-                u = grid[node, 0] / m + world.dt * world.gravity_x
-                v = grid[node, 1] / m + world.dt * world.gravity_y
-                u, v = wall(i0 + a, j0 + b, u, v, world)
-                store(scratch.velocity, node, pack(scratch.velocity, u, v, u, v))
-            else:
-                store(scratch.velocity, node, zero(scratch.velocity))
+def add_blocks(parts, windows, window, a, nodes):
+    """Column a of the window: the sum of what the blocks put there, in their order."""
+    i0, j0, _, nj = window
+    nodes[a * nj : (a + 1) * nj] = 0.0
+    for b in range(parts.shape[0]):
+        column = i0 + a - windows[b, 0]
+        if 0 <= column < windows[b, 2]:
+            source, target = column * windows[b, 3], a * nj + windows[b, 1] - j0
+            for k in range(windows[b, 3]):
+                store(nodes, target + k, load(nodes, target + k) + load(parts[b], source + k))
 
 
 @jit
-def grid_update_adjoint(grid, window, world, scratch):
-    """From velocity_bar of the nodes to their momentum_bar and mass_bar."""
-    i0, j0, ni, nj = window
-    for a in range(ni):
-        for b in range(nj):
-            node = a * nj + b
-            m = grid[node, 2]
-            if m > 0.0:
-                qx, qy = grid[node, 0], grid[node, 1]
-                u_bar, v_bar = wall_adjoint(
-                    i0 + a,
-                    j0 + b,
-                    qx / m + world.dt * world.gravity_x,
-                    qy / m + world.dt * world.gravity_y,
-                    world,
-                    scratch.velocity_bar[node, 0],
-                    scratch.velocity_bar[node, 1],
-                )
-                scratch.node_bar[node, 0] = u_bar / m
-                scratch.node_bar[node, 1] = v_bar / m
-                scratch.node_bar[node, 2] = -(u_bar * qx + v_bar * qy) / (m * m)
-            else:
-                scratch.node_bar[node] = 0.0
+def grid_update(grid, window, world, scratch, a):
+    """Velocity of column a's nodes from momentum, gravity and walls; zero where no mass is."""
+    i0, j0, _, nj = window
+    for b in range(nj):
+        node = a * nj + b
+        m = grid[node, 2]
+        u = v = 0.0 * m
+        if m.real > 0.0:
+            u = grid[node, 0] / m + world.dt * world.gravity_x
+            v = grid[node, 1] / m + world.dt * world.gravity_y
+            u, v = wall(i0 + a, j0 + b, u, v, world)
+        scratch.velocity[node, 0], scratch.velocity[node, 1] = u, v
 
 
 @jit
-def g2p(old, new, world, scratch, window):
+def grid_update_adjoint(grid, window, world, scratch, a):
+    """From velocity_bar of column a's nodes to their momentum_bar and mass_bar."""
+    i0, j0, _, nj = window
+    for b in range(nj):
+        node = a * nj + b
+        m = grid[node, 2]
+        if m > 0.0:
+            qx, qy = grid[node, 0], grid[node, 1]
+            u_bar, v_bar = wall_adjoint(
+                i0 + a,
+                j0 + b,
+                qx / m + world.dt * world.gravity_x,
+                qy / m + world.dt * world.gravity_y,
+                world,
+                scratch.velocity_bar[node, 0],
+                scratch.velocity_bar[node, 1],
+            )
+            scratch.node_bar[node, 0] = u_bar / m
+            scratch.node_bar[node, 1] = v_bar / m
+            scratch.node_bar[node, 2] = -(u_bar * qx + v_bar * qy) / (m * m)
+        else:
+            scratch.node_bar[node] = 0.0
+
+
+@jit
+def g2p(old, new, world, tile, scratch, window, first, last):
     """Grid to particle: the new velocity, affine velocity and position."""
     i0, j0, _, nj = window
-    c = 4.0 / world.dx**2
-    velocity = scratch.velocity
-    for p in range(old.shape[1]):
-        i, wx, rx = weights(old[0, p], world.dx)
-        j, wy, ry = weights(old[1, p], world.dx)
-        # Lanes: sums over u and v, then over u r_y and v r_y.
-        across_0 = pack(velocity, wy[0], wy[0], wy[0] * ry[0], wy[0] * ry[0])
-        across_1 = pack(velocity, wy[1], wy[1], wy[1] * ry[1], wy[1] * ry[1])
-        across_2 = pack(velocity, wy[2], wy[2], wy[2] * ry[2], wy[2] * ry[2])
-        mean = along = zero(velocity)
-        for a in range(3):
-            node = (i - i0 + a) * nj + j - j0
-            row = add_scaled(across_0, load(velocity, node), zero(velocity))
-            row = add_scaled(across_1, load(velocity, node + 1), row)
-            row = add_scaled(across_2, load(velocity, node + 2), row)
-            mean = add_scaled(wx[a], row, mean)
-            along = add_scaled(wx[a] * rx[a], row, along)
-        u, v = mean[0], mean[1]
-        c00, c01, c10, c11 = along[0], mean[2], along[1], mean[3]
-        new[0, p] = old[0, p] + world.dt * u
-        new[1, p] = old[1, p] + world.dt * v
-        new[2, p], new[3, p] = u, v
-        new[4, p], new[5, p], new[6, p], new[7, p] = c * c00, c * c01, c * c10, c * c11
+    c, dt = 4.0 / world.dx**2, world.dt
+    for g in range(first, last):
+        t = g - first
+        for k in range(4):
+            i, j = number(tile.base, 2 * t, k), number(tile.base, 2 * t + 1, k)
+            node = (int(i) - i0) * nj + int(j) - j0
+            w_x, wr_x = spreads(tile, 24 * t, k), spreads(tile, 24 * t + 3, k)
+            w_wr = blends(spreads(tile, 24 * t + 6, k), spreads(tile, 24 * t + 9, k))
+            row_0 = g2p_row(scratch.velocity, node, w_wr)
+            row_1 = g2p_row(scratch.velocity, node + nj, w_wr)
+            row_2 = g2p_row(scratch.velocity, node + 2 * nj, w_wr)
+            mean = w_x[0] * row_0 + w_x[1] * row_1 + w_x[2] * row_2  # w u, w r_y u
+            along = wr_x[0] * row_0 + wr_x[1] * row_1 + wr_x[2] * row_2  # w r_x u
+            set_number(new, 12 * g + 2, k, mean[0])
+            set_number(new, 12 * g + 3, k, mean[1])
+            set_number(new, 12 * g + 4, k, along[0])
+            set_number(new, 12 * g + 5, k, mean[2])
+            set_number(new, 12 * g + 6, k, along[1])
+            set_number(new, 12 * g + 7, k, mean[3])
+        store(new, 12 * g, load(old, 12 * g) + dt * load(new, 12 * g + 2))
+        store(new, 12 * g + 1, load(old, 12 * g + 1) + dt * load(new, 12 * g + 3))
+        c00, c01, c10, c11 = tensor(new, 12 * g + 4)
+        store_tensor(new, 12 * g + 4, c * c00, c * c01, c * c10, c * c11)
 
 
 @jit
-def g2p_adjoint(old, new, world, scratch, window, bar):
-    """From x_bar', v_bar', C_bar' to velocity_bar of the nodes; turns x_bar' into x_bar."""
-    i0, j0, ni, nj = window
-    c = 4.0 / world.dx**2
-    velocity, velocity_bar = scratch.velocity, scratch.velocity_bar
-    velocity_bar[: ni * nj] = 0.0
-    for p in range(old.shape[1]):
-        i, wx, rx = weights(old[0, p], world.dx)
-        j, wy, ry = weights(old[1, p], world.dx)
-        slope_x = weight_slopes(old[0, p], world.dx)
-        slope_y = weight_slopes(old[1, p], world.dx)
-        u, v = new[2, p], new[3, p]
-        u_bar = bar[2, p] + world.dt * bar[0, p]
-        v_bar = bar[3, p] + world.dt * bar[1, p]
-        c00, c01, c10, c11 = c * bar[4, p], c * bar[5, p], c * bar[6, p], c * bar[7, p]
-        # Sums over the nodes, named as in `p2g_adjoint`. Lanes: over u and v, then u r_y and v r_y.
-        s_w = sr_w = w_s = wr_s = zero(velocity)
-        down = pack(velocity, c01, c11, 0.0, 0.0)
-        for a in range(3):
-            node = (i - i0 + a) * nj + j - j0
-            row = pack(velocity, u_bar + c00 * rx[a], v_bar + c10 * rx[a], 0.0, 0.0)
-            row_w = row_s = zero(velocity)
-            for b in range(3):
-                w, wr, s, sr = wy[b], wy[b] * ry[b], slope_y[b], slope_y[b] * ry[b]
-                record = load(velocity, node + b)
-                row_w = add_scaled(pack(velocity, w, w, wr, wr), record, row_w)
-                row_s = add_scaled(pack(velocity, s, s, sr, sr), record, row_s)
-                h = add_scaled(ry[b], down, row)
-                h = add_scaled(wx[a] * w, h, load(velocity_bar, node + b))
-                store(velocity_bar, node + b, h)
-            s_w = add_scaled(slope_x[a], row_w, s_w)
-            sr_w = add_scaled(slope_x[a] * rx[a], row_w, sr_w)
-            w_s = add_scaled(wx[a], row_s, w_s)
-            wr_s = add_scaled(wx[a] * rx[a], row_s, wr_s)
-        bar[0, p] += (
-            (u_bar * s_w[0] + c00 * sr_w[0] + c01 * s_w[2])
-            + (v_bar * s_w[1] + c10 * sr_w[1] + c11 * s_w[3])
-            - (c00 * u + c10 * v)
-        )
-        bar[1, p] += (
-            (u_bar * w_s[0] + c00 * wr_s[0] + c01 * w_s[2])
-            + (v_bar * w_s[1] + c10 * wr_s[1] + c11 * w_s[3])
-            - (c01 * u + c11 * v)
-        )
+def g2p_row(velocity, n, w_wr):
+    """Sums over three nodes in a row: w u and w r u."""
+    row = w_wr[0] * load_pair(velocity, n) + w_wr[1] * load_pair(velocity, n + 1)
+    return row + w_wr[2] * load_pair(velocity, n + 2)
+
+
+@jit
+def g2p_adjoint(old, new, world, tile, scratch, window, bar, part_window, part, first, last):
+    """From x_bar', v_bar', C_bar' to velocity_bar of the nodes; turns x_bar' into x_bar.
+
+    Velocities come from the whole window, their adjoints go to a block's part of it.
+    """
+    i0, j0, _, nj = window
+    i1, j1, _, nl = part_window
+    c, dt, velocity = 4.0 / world.dx**2, world.dt, scratch.velocity
+    for g in range(first, last):
+        t = g - first
+        x_bar, y_bar = load(bar, 12 * g), load(bar, 12 * g + 1)
+        c00, c01, c10, c11 = tensor(bar, 12 * g + 4)
+        c00, c01, c10, c11 = c * c00, c * c01, c * c10, c * c11
+        store_tensor(bar, 12 * g + 4, c00, c01, c10, c11)
+        add(bar, 12 * g + 2, dt * x_bar)
+        add(bar, 12 * g + 3, dt * y_bar)
+        u, v = load(new, 12 * g + 2), load(new, 12 * g + 3)
+        store(bar, 12 * g, x_bar - c00 * u - c10 * v)
+        store(bar, 12 * g + 1, y_bar - c01 * u - c11 * v)
+        for k in range(4):
+            i, j = int(number(tile.base, 2 * t, k)), int(number(tile.base, 2 * t + 1, k))
+            node, part_node = (i - i0) * nj + j - j0, (i - i1) * nl + j - j1
+            w_x, w_y = spreads(tile, 24 * t, k), spreads(tile, 24 * t + 6, k)
+            r_x, s_x = spreads(tile, 24 * t + 12, k), spreads(tile, 24 * t + 15, k)
+            r_y, s_y = spreads(tile, 24 * t + 18, k), spreads(tile, 24 * t + 21, k)
+            w_s, s_w = blends(w_y, s_y), blends(s_x, w_x)
+            v_bar = pair(number(bar, 12 * g + 2, k), number(bar, 12 * g + 3, k))
+            c0 = pair(number(bar, 12 * g + 4, k), number(bar, 12 * g + 6, k))
+            c1 = pair(number(bar, 12 * g + 5, k), number(bar, 12 * g + 7, k))
+            slope_0 = g2p_adjoint_row(
+                part, part_node, velocity, node, v_bar + r_x[0] * c0, c1, w_x[0], w_y, r_y, w_s
+            )
+            slope_1 = g2p_adjoint_row(
+                part, part_node + nl, velocity, node + nj, v_bar + r_x[1] * c0, c1, w_x[1], w_y,
+                r_y, w_s,
+            )  # fmt: skip
+            slope_2 = g2p_adjoint_row(
+                part, part_node + 2 * nl, velocity, node + 2 * nj, v_bar + r_x[2] * c0, c1, w_x[2],
+                w_y, r_y, w_s,
+            )  # fmt: skip
+            slope = s_w[0] * slope_0 + s_w[1] * slope_1 + s_w[2] * slope_2
+            set_number(bar, 12 * g, k, number(bar, 12 * g, k) + (slope[0] + slope[1]))
+            set_number(bar, 12 * g + 1, k, number(bar, 12 * g + 1, k) + (slope[2] + slope[3]))
+
+
+@jit
+def g2p_adjoint_row(part, k, velocity, n, v_bar, c1, w_x, w, r, w_s):
+    """Add w_x w (v_bar + c1 r) to three nodes in a row; the sum of w, s times it, times u."""
+    u_bar = v_bar + r[0] * c1
+    add(part, k, (w_x * w[0]) * u_bar)
+    slope = w_s[0] * (u_bar * load_pair(velocity, n))
+    u_bar = v_bar + r[1] * c1
+    add(part, k + 1, (w_x * w[1]) * u_bar)
+    slope = slope + w_s[1] * (u_bar * load_pair(velocity, n + 1))
+    u_bar = v_bar + r[2] * c1
+    add(part, k + 2, (w_x * w[2]) * u_bar)
+    return slope + w_s[2] * (u_bar * load_pair(velocity, n + 2))
 
 
 @loop_jit
-def advance(states, grids, windows, logs, first, last, body, world, signal, scratch):
+def advance(states, grids, windows, logs, first, last, body, world, signal, scratch, thread,
+            threads):  # fmt: skip
     """Advance from the start of step `first` to the start of step `last`.
 
-    Step n leads from slot n to slot n + 1 of `states` and leaves its nodes in slot n of `grids` and
-    `windows` and its ln J' in slot n of `logs`; slots are counted round, so that two states and one
-    of the others suffice where nothing is kept. Returns the step reached, how it ended, and the
-    particle concerned (or -1); when the window does not fit into the records, more records and
-    another call from the step reached go on.
+    Step n leads from slot n to slot n + 1 of `states` and leaves its nodes in slot n of `grids`,
+    its windows (those of the blocks, then the whole one) in slot n of `windows` and its ln J' in
+    slot n of `logs`; slots are counted round, so that two states and one of the others suffice
+    where nothing is kept. Returns the step reached, how it ended, and the particle concerned (or
+    -1); when a window does not fit into the records, more records and another call from the step
+    reached go on.
+
+    Called by `threads` threads at once, each with its number. Each takes its blocks of particles
+    and its columns of nodes; what blocks put on nodes is added in their order, so that results do
+    not depend on the number of threads.
     """
-    for n in range(first, last):
+    blocks = body.first.size - 1
+    own = range(thread * blocks // threads, (thread + 1) * blocks // threads)
+    parts, ends = scratch.parts, scratch.ends
+    tile = make_tile(TILE, states)
+    for n in range(first, last + 1):
         old = states[n % states.shape[0]]
         new = states[(n + 1) % states.shape[0]]
         slot = n % grids.shape[0]
         grid, log_J = grids[slot], logs[slot]
-        i0, j0, ni, nj, particle = find_window(old, world)
-        if particle >= 0:
-            return n, ESCAPED, particle
+        for k in own:
+            p0, p1 = body.first[k], body.first[k + 1]
+            i0, j0, ni, nj, inside = find_window(old, world, p0, p1)
+            ends[k, 0], ends[k, 1] = DONE, -1
+            if not inside:
+                ends[k, 0], ends[k, 1] = ESCAPED, first_outside(old, world, p0, p1)
+            elif n < last:
+                windows[slot, k, 0], windows[slot, k, 1] = i0, j0
+                windows[slot, k, 2], windows[slot, k, 3] = ni, nj
+                if ni * nj > parts.shape[1]:
+                    ends[k, 0] = WINDOW_TOO_SMALL
+                else:
+                    parts[k, : ni * nj] = 0.0
+                    for g0 in range(p0, p1, TILE):
+                        g1 = min(g0 + TILE, p1)
+                        if not deform(old, new, world, log_J, g0, g1):
+                            ends[k, 0], ends[k, 1] = INVERTED, first_inverted(new, g0, g1)
+                            break
+                        locate(old, world, tile, g0, g1)
+                        stress(old, new, log_J, body, world, signal[n], tile, g0, g1)
+                        p2g(old, body, world, tile, (i0, j0, ni, nj), parts[k], g0, g1)
+        meet(scratch.meeting, threads)
+        for k in range(blocks):
+            if ends[k, 0] != DONE:
+                return n, ends[k, 0], ends[k, 1]
+        if n == last:
+            break
+        i0, j0, ni, nj = whole_window(windows[slot, :blocks], world)
+        window = (i0, j0, ni, nj)
         if ni * nj > grid.shape[0]:
             return n, WINDOW_TOO_SMALL, -1
-        window = (i0, j0, ni, nj)
-        for k in range(4):
-            windows[slot, k] = window[k]
-        particle = deform(old, new, world, log_J)
-        if particle >= 0:
-            return n, INVERTED, particle
-        stress(old, new, log_J, body, world, signal[n], scratch)
-        p2g(old, body, world, scratch, window, grid)
-        mirror(grid, window, world)
-        grid_update(grid, window, world, scratch)
-        g2p(old, new, world, scratch, window)
-    particle = find_window(states[last % states.shape[0]], world)[4]
-    return last, DONE if particle < 0 else ESCAPED, particle
+        if thread == 0:
+            for k in range(4):
+                windows[slot, blocks, k] = window[k]
+        columns = range(thread * ni // threads, (thread + 1) * ni // threads)
+        for a in columns:
+            add_blocks(parts, windows[slot], window, a, grid)
+        if world.mirror_axis >= 0:
+            meet(scratch.meeting, threads)
+            if thread == 0:
+                mirror(grid, window, world)
+            meet(scratch.meeting, threads)
+        for a in columns:
+            grid_update(grid, window, world, scratch, a)
+        meet(scratch.meeting, threads)
+        for k in own:
+            for g0 in range(body.first[k], body.first[k + 1], TILE):
+                g1 = min(g0 + TILE, body.first[k + 1])
+                locate(old, world, tile, g0, g1)
+                g2p(old, new, world, tile, scratch, window, g0, g1)
+    return last, DONE, -1
 
 
 @loop_jit
 def advance_adjoint(states, grids, windows, logs, first, last, body, world, signal, scratch, bar,
-                    body_bar, signal_bar):  # fmt: skip
+                    body_bar, signal_bar, thread, threads):  # fmt: skip
     """Go back from the start of step `last` to the start of step `first`: the adjoint of `advance`.
 
     `bar` (12, N) holds the adjoint of the state and is overwritten; `body_bar` and `signal_bar`
-    (steps, K) are added to. All that `advance` leaves of the steps must have been kept.
+    (B, steps, K), by blocks, are added to. All that `advance` leaves of the steps must have been
+    kept.
     """
+    blocks = body.first.size - 1
+    own = range(thread * blocks // threads, (thread + 1) * blocks // threads)
+    parts = scratch.parts
+    tile = make_tile(TILE, states)
     for n in range(last - 1, first - 1, -1):
         old, new, grid, log_J = states[n], states[n + 1], grids[n], logs[n]
-        window = (windows[n, 0], windows[n, 1], windows[n, 2], windows[n, 3])
-        stress(old, new, log_J, body, world, signal[n], scratch)
-        grid_update(grid, window, world, scratch)
-        g2p_adjoint(old, new, world, scratch, window, bar)
-        grid_update_adjoint(grid, window, world, scratch)
-        mirror(scratch.node_bar, window, world)
-        p2g_adjoint(old, body, world, scratch, window, bar, body_bar)
-        stress_adjoint(
-            old, new, log_J, body, world, signal[n], scratch, bar, body_bar, signal_bar[n]
-        )
-        deform_adjoint(old, world, bar)
+        w = windows[n, blocks]
+        ni, window = w[2], (w[0], w[1], w[2], w[3])
+        columns = range(thread * ni // threads, (thread + 1) * ni // threads)
+        for a in columns:
+            grid_update(grid, window, world, scratch, a)
+        meet(scratch.meeting, threads)
+        for k in own:
+            p0, p1 = body.first[k], body.first[k + 1]
+            w = windows[n, k]
+            part = (w[0], w[1], w[2], w[3])
+            parts[k, : w[2] * w[3]] = 0.0
+            for g0 in range(p0, p1, TILE):
+                g1 = min(g0 + TILE, p1)
+                locate(old, world, tile, g0, g1)
+                locate_adjoint(old, world, tile, g0, g1)
+                g2p_adjoint(old, new, world, tile, scratch, window, bar, part, parts[k], g0, g1)
+        meet(scratch.meeting, threads)
+        for a in columns:
+            add_blocks(parts, windows[n], window, a, scratch.velocity_bar)
+            grid_update_adjoint(grid, window, world, scratch, a)
+        meet(scratch.meeting, threads)
+        if world.mirror_axis >= 0:
+            if thread == 0:
+                mirror(scratch.node_bar, window, world)
+            meet(scratch.meeting, threads)
+        for k in own:
+            p0, p1 = body.first[k], body.first[k + 1]
+            for g0 in range(p0, p1, TILE):
+                g1 = min(g0 + TILE, p1)
+                locate(old, world, tile, g0, g1)
+                locate_adjoint(old, world, tile, g0, g1)
+                stress(old, new, log_J, body, world, signal[n], tile, g0, g1)
+                p2g_adjoint(old, body, world, tile, scratch, window, bar, body_bar, g0, g1)
+                stress_adjoint(
+                    old, new, log_J, body, world, signal[n], tile, bar, body_bar, signal_bar[k, n],
+                    g0, g1,
+                )  # fmt: skip
+                deform_adjoint(old, world, bar, g0, g1)
 
 
-# Records of four numbers. These functions on tuples are their definition; in double precision the
-# compiler is given vector registers instead, which it does not find by itself.
+@jit
+def first_inverted(state, first, last):
+    """The first particle of groups of four whose deformation gradient is inverted."""
+    for p in range(4 * first, 4 * last):
+        f, k = 12 * (p // 4) + 8, p % 4
+        if not (state[f, k] * state[f + 3, k] - state[f + 1, k] * state[f + 2, k]).real > 0.0:
+            return p
+    return -1
+
+
+@jit
+def first_outside(state, world, first, last):
+    """The first particle of groups of four that is off the grid, or is not a number."""
+    lo, hi = 0.5 * world.dx, -1.5 * world.dx
+    for p in range(4 * first, 4 * last):
+        x, y = state[12 * (p // 4), p % 4].real, state[12 * (p // 4) + 1, p % 4].real
+        inside_x = lo <= x < hi + world.nodes_x * world.dx
+        if not (inside_x and lo <= y < hi + world.nodes_y * world.dx):
+            return p
+    return -1
+
+
+def grouped(array: NDArray, mode: Literal["edge", "constant"] = "edge") -> NDArray:
+    """R numbers (R, N) of N particles as records (R G, 4) of groups of four; (N,) as (G, 4).
+
+    Repeats of the last particle, or zeros, fill the last group.
+    """
+    rows = np.atleast_2d(array)
+    filled = np.pad(rows, [(0, 0), (0, -rows.shape[1] % 4)], mode)
+    return np.ascontiguousarray(np.moveaxis(filled.reshape(len(rows), -1, 4), 1, 0)).reshape(-1, 4)
+
+
+def ungrouped(records: NDArray, rows: int, particles: int) -> NDArray:
+    """The inverse of `grouped`: (rows, particles)."""
+    parts = np.moveaxis(records.reshape(-1, rows, 4), 0, 1)
+    return parts.reshape(rows, -1)[:, :particles].copy()
+
+
+# Records of four numbers: of a node, or one number of four particles in a row. These functions on
+# numpy arrays are their definition; compiled, a record is a vector register of the processor.
 
 
 def load(array, k):
     """Record k of an array (M, 4)."""
-    return array[k, 0], array[k, 1], array[k, 2], array[k, 3]
+    return array[k].copy()
+
+
+def load_pair(array, k):
+    """The first two numbers of record k of an array (M, ...), twice."""
+    return np.tile(array[k, :2], 2)
 
 
 def store(array, k, record):
     """Write record k of an array (M, 4)."""
-    array[k, 0], array[k, 1], array[k, 2], array[k, 3] = record
+    array[k] = record
 
 
-def zero(array):
-    """The record of zeros of an array's type."""
-    z = array.dtype.type(0.0)
-    return z, z, z, z
+def number(array, k, lane):
+    """One number of record k of an array (M, 4)."""
+    return array[k, lane]
 
 
-def pack(array, a, b, c, d):
-    """The record of four numbers, of an array's type."""
-    return a, b, c, d
+def set_number(array, k, lane, value):
+    """Write what `number` reads."""
+    array[k, lane] = value
 
 
-def add_scaled(s, x, y):
-    """The record s x + y; s is a number or a record."""
-    if not isinstance(s, tuple):
-        s = (s, s, s, s)
-    return s[0] * x[0] + y[0], s[1] * x[1] + y[1], s[2] * x[2] + y[2], s[3] * x[3] + y[3]
+def spread(number):
+    """The record of four times the same number."""
+    return np.full(4, number)
+
+
+def pack(a, b, c, d):
+    """The record of four numbers."""
+    return np.array([a, b, c, d])
+
+
+def pair(a, b):
+    """The record of two numbers, twice."""
+    return np.array([a, b, a, b])
+
+
+def blend(x, y):
+    """The first half of record x and the second half of y."""
+    return np.concatenate([x[:2], y[2:]])
+
+
+def alternate(x, y):
+    """The even numbers of record x and the odd ones of y."""
+    return np.array([x[0], y[1], x[2], y[3]])
+
+
+def total(x):
+    """The sum of a record's numbers."""
+    return x.sum()
+
+
+def positive(x):
+    """Whether a number, or all of a record, are above zero; what is not a number is not."""
+    return bool(np.all(np.real(x) > 0.0))
+
+
+def logarithm(x):
+    """The natural logarithm of a positive number or record."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.log(x)
+
+
+def meet(meeting, threads):
+    """Wait until all threads are here."""
+
+
+def real(x):
+    """The real parts of a record."""
+    return np.real(x)
+
+
+def whole(x):
+    """The numbers of a real record without their fractions."""
+    return np.trunc(x)
+
+
+def within(x, low, high):
+    """Whether low <= x < high for all of a real record; not if one is not a number."""
+    return bool(np.all((low <= x) & (x < high)))
+
+
+def least(x, y):
+    """The smaller numbers of two real records."""
+    return np.minimum(x, y)
+
+
+def greatest(x, y):
+    """The larger numbers of two real records."""
+    return np.maximum(x, y)
+
+
+@jit
+def tensor(array, k):
+    """Records k to k + 3: the components of a tensor."""
+    return load(array, k), load(array, k + 1), load(array, k + 2), load(array, k + 3)
+
+
+@jit
+def store_tensor(array, k, x00, x01, x10, x11):
+    """Write what `tensor` reads."""
+    store(array, k, x00)
+    store(array, k + 1, x01)
+    store(array, k + 2, x10)
+    store(array, k + 3, x11)
+
+
+@jit
+def add(array, k, record):
+    """Add to record k of an array (M, 4)."""
+    store(array, k, load(array, k) + record)
 
 
 class Register(types.Type):
-    """A record in a vector register."""
+    """A record in a vector register: four doubles, or four complex numbers as eight."""
 
-    def __init__(self):
-        super().__init__("Register")
-
-
-register = Register()
-VECTOR = ir.VectorType(ir.DoubleType(), NODE_SIZE)
-FLAGS = ("contract", "reassoc", "nsz", "arcp")
+    def __init__(self, dtype):
+        self.dtype = dtype
+        super().__init__(f"Register({dtype})")
 
 
 @register_model(Register)
@@ -675,70 +1041,286 @@ class RegisterModel(models.PrimitiveModel):
     """As a vector of LLVM."""
 
     def __init__(self, manager, kind):
-        super().__init__(manager, kind, VECTOR)
+        super().__init__(manager, kind, _vector(kind.dtype))
 
 
-def _record_pointer(context, builder, signature, arguments):
-    array_type = signature.args[0]
-    array = context.make_array(array_type)(context, builder, arguments[0])
-    first = context.get_constant(types.intp, 0)
-    pointer = cgutils.get_item_pointer(
-        context, builder, array_type, array, [arguments[1], first], wraparound=False
-    )
-    return builder.bitcast(pointer, VECTOR.as_pointer())
+FLAGS = ("contract", "reassoc", "nsz", "arcp")
+INT32 = ir.IntType(32)
 
 
-def _broadcast(builder, values):
-    vector = ir.Constant(VECTOR, ir.Undefined)
-    for lane, value in enumerate(values):
-        vector = builder.insert_element(vector, value, ir.Constant(ir.IntType(32), lane))
+def _vector(dtype):
+    return ir.VectorType(ir.DoubleType(), 4 if dtype == types.float64 else 8)
+
+
+def _shuffle(builder, x, y, lanes):
+    mask = ir.Constant(ir.VectorType(INT32, len(lanes)), lanes)
+    return builder.shuffle_vector(x, y, mask)
+
+
+def _doubles(context, builder, dtype, value):
+    """The doubles of a number: one, or the parts of a complex one."""
+    if dtype == types.float64:
+        return [value]
+    value = context.make_complex(builder, dtype, value)
+    return [value.real, value.imag]
+
+
+def _vector_of(context, builder, dtype, values):
+    """The vector of four numbers."""
+    vector = ir.Constant(_vector(dtype), ir.Undefined)
+    doubles = [d for value in values for d in _doubles(context, builder, dtype, value)]
+    for lane, value in enumerate(doubles):
+        vector = builder.insert_element(vector, value, INT32(lane))
     return vector
+
+
+def _pointer(context, builder, array_type, array, k, vector, lane=None):
+    """To record k of an array (M, 4), whose strides the compiler need not look up, or to a lane."""
+    array = context.make_array(array_type)(context, builder, array)
+    width = NODE_SIZE if array_type.ndim == 2 else 1
+    place = builder.mul(k, k.type(width))
+    if lane is not None:
+        place = builder.add(place, lane)
+    return builder.bitcast(builder.gep(array.data, [place]), vector.as_pointer())
+
+
+@intrinsic
+def _number(typingctx, array, k, lane):
+    def generate(context, builder, signature, arguments):
+        kind = context.get_data_type(array.dtype)
+        return builder.load(_pointer(context, builder, array, *arguments[:2], kind, arguments[2]))
+
+    return array.dtype(array, types.intp, types.intp), generate
+
+
+@intrinsic
+def _set_number(typingctx, array, k, lane, value):
+    def generate(context, builder, signature, arguments):
+        kind = context.get_data_type(array.dtype)
+        pointer = _pointer(context, builder, array, *arguments[:2], kind, arguments[2])
+        builder.store(arguments[3], pointer)
+        return context.get_dummy_value()
+
+    return types.none(array, types.intp, types.intp, array.dtype), generate
 
 
 @intrinsic
 def _load(typingctx, array, k):
     def generate(context, builder, signature, arguments):
-        return builder.load(_record_pointer(context, builder, signature, arguments), align=8)
+        vector = _vector(array.dtype)
+        pointer = _pointer(context, builder, array, arguments[0], arguments[1], vector)
+        return builder.load(pointer, align=8)
 
-    return register(array, types.intp), generate
+    return Register(array.dtype)(array, types.intp), generate
+
+
+@intrinsic
+def _load_pair(typingctx, array, k):
+    def generate(context, builder, signature, arguments):
+        half = ir.VectorType(ir.DoubleType(), _vector(array.dtype).count // 2)
+        pointer = _pointer(context, builder, array, arguments[0], arguments[1], half)
+        pair = builder.load(pointer, align=8)
+        return _shuffle(builder, pair, pair, 2 * list(range(half.count)))
+
+    return Register(array.dtype)(array, types.intp), generate
 
 
 @intrinsic
 def _store(typingctx, array, k, record):
     def generate(context, builder, signature, arguments):
-        pointer = _record_pointer(context, builder, signature, arguments)
+        vector = _vector(array.dtype)
+        pointer = _pointer(context, builder, array, arguments[0], arguments[1], vector)
         builder.store(arguments[2], pointer, align=8)
         return context.get_dummy_value()
 
-    return types.none(array, types.intp, record), generate
+    return types.none(array, types.intp, Register(array.dtype)), generate
 
 
 @intrinsic
 def _pack(typingctx, a, b, c, d):
     def generate(context, builder, signature, arguments):
-        return _broadcast(builder, arguments)
+        return _vector_of(context, builder, a, arguments)
 
-    return register(*4 * (types.float64,)), generate
+    return Register(a)(a, a, a, a), generate
 
 
 @intrinsic
-def _add_scaled(typingctx, s, x, y):
+def _spread(typingctx, a):
     def generate(context, builder, signature, arguments):
-        factor, x, y = arguments
-        if signature.args[0] == types.float64:
-            factor = _broadcast(builder, NODE_SIZE * [factor])
-        return builder.fadd(builder.fmul(factor, x, flags=FLAGS), y, flags=FLAGS)
+        vector = _vector_of(context, builder, a, arguments)
+        lanes = [0] * 4 if a == types.float64 else [0, 1] * 4
+        return _shuffle(builder, vector, vector, lanes)
 
-    return register(s, x, y), generate
+    return Register(a)(a), generate
+
+
+def _choice(second):
+    """Of two records: the numbers marked in `second` from the second one."""
+
+    @intrinsic
+    def choose(typingctx, x, y):
+        def generate(context, builder, signature, arguments):
+            width = _vector(x.dtype).count
+            of = width // 4
+            lanes = [k + width * second[k // of] for k in range(width)]
+            return _shuffle(builder, *arguments, lanes)
+
+        return x(x, x), generate
+
+    return choose
+
+
+def _real_parts(builder, record, vector):
+    return (
+        vector if record.dtype == types.float64 else _shuffle(builder, vector, vector, [0, 2, 4, 6])
+    )
+
+
+def _all(builder, lanes):
+    return functools.reduce(
+        builder.and_, [builder.extract_element(lanes, INT32(k)) for k in range(4)]
+    )
+
+
+@intrinsic
+def _real(typingctx, x):
+    def generate(context, builder, signature, arguments):
+        return _real_parts(builder, x, arguments[0])
+
+    return Register(types.float64)(x), generate
+
+
+@intrinsic
+def _whole(typingctx, x):
+    def generate(context, builder, signature, arguments):
+        value = builder.fptosi(arguments[0], ir.VectorType(ir.IntType(64), 4))
+        return builder.sitofp(value, _vector(types.float64))
+
+    return x(x), generate
+
+
+@intrinsic
+def _within(typingctx, x, low, high):
+    def generate(context, builder, signature, arguments):
+        above = builder.fcmp_ordered("<=", arguments[1], arguments[0])
+        below = builder.fcmp_ordered("<", arguments[0], arguments[2])
+        return _all(builder, builder.and_(above, below))
+
+    return types.boolean(x, low, high), generate
+
+
+def _extreme(symbol):
+    @intrinsic
+    def extreme(typingctx, x, y):
+        def generate(context, builder, signature, arguments):
+            return builder.select(builder.fcmp_ordered(symbol, *arguments), *arguments)
+
+        return x(x, y), generate
+
+    return extreme
+
+
+_least, _greatest = _extreme("<"), _extreme(">")
+_blend = _choice((0, 0, 1, 1))
+_alternate = _choice((0, 1, 0, 1))
+
+
+def _arithmetic(name):
+    @intrinsic
+    def operate(typingctx, x, y):
+        def generate(context, builder, signature, arguments):
+            a, b = arguments
+            if x.dtype == types.float64 or name in ("fadd", "fsub"):
+                return getattr(builder, name)(a, b, flags=FLAGS)
+            # (a.re + i a.im) b = a.re b + a.im (i b)
+            re, im = [0, 0, 2, 2, 4, 4, 6, 6], [1, 1, 3, 3, 5, 5, 7, 7]
+            turned = _shuffle(builder, b, b, [1, 0, 3, 2, 5, 4, 7, 6])
+            signs = ir.Constant(_vector(x.dtype), 4 * [-1.0, 1.0])
+            turned = builder.fmul(turned, signs, flags=FLAGS)
+            real = builder.fmul(_shuffle(builder, a, a, re), b, flags=FLAGS)
+            imaginary = builder.fmul(_shuffle(builder, a, a, im), turned, flags=FLAGS)
+            return builder.fadd(real, imaginary, flags=FLAGS)
+
+        return x(x, x), generate
+
+    return operate
+
+
+def _overload_arithmetic(symbol, name):
+    operate = _arithmetic(name)
+
+    @overload(symbol)
+    def arithmetic(x, y):
+        if not (isinstance(x, Register) or isinstance(y, Register)):
+            return None
+        if types.complex128 in (getattr(x, "dtype", x), getattr(y, "dtype", y)):
+            return lambda x, y: operate(_as_complex(x), _as_complex(y))
+        return lambda x, y: operate(_as_real(x), _as_real(y))
+
+
+def _as_real(x):
+    """A record of real numbers."""
+
+
+def _as_complex(x):
+    """A record of complex numbers."""
+
+
+@overload(_as_real)
+def _overload_as_real(x):
+    if isinstance(x, Register):
+        return lambda x: x
+    return lambda x: _spread(float(x))
+
+
+@overload(_as_complex)
+def _overload_as_complex(x):
+    if not isinstance(x, Register):
+        return lambda x: _spread(complex(x))
+    if x.dtype == types.complex128:
+        return lambda x: x
+    return lambda x: _pack(complex(x[0]), complex(x[1]), complex(x[2]), complex(x[3]))
+
+
+for _symbol, _name in (
+    (operator.add, "fadd"),
+    (operator.sub, "fsub"),
+    (operator.mul, "fmul"),
+    (operator.iadd, "fadd"),
+):
+    _overload_arithmetic(_symbol, _name)
+
+
+@intrinsic
+def _divide(typingctx, x, y):
+    def generate(context, builder, signature, arguments):
+        x_lanes, y_lanes = arguments
+        if x.dtype == types.complex128:
+            y_lanes = _shuffle(builder, y_lanes, y_lanes, [0, 0, 1, 1, 2, 2, 3, 3])
+        return builder.fdiv(x_lanes, y_lanes, flags=FLAGS)
+
+    return x(x, y), generate
+
+
+@overload(operator.truediv)
+def _overload_divide(x, y):
+    if isinstance(x, Register) and types.complex128 not in (y, getattr(y, "dtype", y)):
+        return lambda x, y: _divide(x, _as_real(y))
 
 
 @intrinsic
 def _lane(typingctx, record, k):
     def generate(context, builder, signature, arguments):
-        lane = builder.trunc(arguments[1], ir.IntType(32))
-        return builder.extract_element(arguments[0], lane)
+        lane = builder.trunc(arguments[1], INT32)
+        if record.dtype == types.float64:
+            return builder.extract_element(arguments[0], lane)
+        value = context.make_complex(builder, record.dtype)
+        lane = builder.shl(lane, INT32(1))
+        value.real = builder.extract_element(arguments[0], lane)
+        value.imag = builder.extract_element(arguments[0], builder.add(lane, INT32(1)))
+        return value._getvalue()
 
-    return types.float64(record, types.intp), generate
+    return record.dtype(record, types.intp), generate
 
 
 @overload(operator.getitem)
@@ -747,43 +1329,198 @@ def _getitem(record, k):
         return lambda record, k: _lane(record, k)
 
 
+@intrinsic
+def _positive(typingctx, record):
+    def generate(context, builder, signature, arguments):
+        value = _real_parts(builder, record, arguments[0])
+        zeros = ir.Constant(_vector(types.float64), None)
+        return _all(builder, builder.fcmp_ordered(">", value, zeros))
+
+    return types.boolean(record), generate
+
+
+@intrinsic
+def _exponent_and_fraction(typingctx, record):
+    """x = 2^k m with m from sqrt(1/2) to sqrt(2): the records of k and m."""
+    result = types.UniTuple(record, 2)
+
+    def generate(context, builder, signature, arguments):
+        integers = ir.VectorType(ir.IntType(64), 4)
+
+        def constant(value):
+            return ir.Constant(integers, 4 * [value])
+
+        bits = builder.bitcast(arguments[0], integers)
+        half = constant(int(np.float64(0.5**0.5).view(np.int64)))
+        k = builder.ashr(builder.sub(bits, half), constant(52))
+        m = builder.bitcast(builder.sub(bits, builder.shl(k, constant(52))), _vector(record.dtype))
+        k = builder.sitofp(k, _vector(record.dtype))
+        return context.make_tuple(builder, result, [k, m])
+
+    return result(record), generate
+
+
+@jit
+def _log(x):
+    """ln x = k ln 2 + 2 artanh(s), s = (m - 1) / (m + 1), where x = 2^k m; |s| < 0.1716."""
+    k, m = _exponent_and_fraction(x)
+    s = (m - 1.0) / (m + 1.0)
+    z = s * s
+    z2 = z * z
+    odd = 1.0 / 25.0 + z2 * 0.0
+    even = 1.0 / 23.0 + z2 * 0.0
+    for power in (21.0, 17.0, 13.0, 9.0, 5.0):
+        odd = 1.0 / power + z2 * odd
+    for power in (19.0, 15.0, 11.0, 7.0, 3.0):
+        even = 1.0 / power + z2 * even
+    series = even + z * odd  # 1/3 + z/5 + z^2/7 + ...
+    return k * LN2 + (2.0 * s + 2.0 * s * z * series)
+
+
+LN2 = math.log(2.0)
+
+
 @overload(load)
 def _overload_load(array, k):
-    if array.dtype == types.float64:
-        return lambda array, k: _load(array, k)
-    return load
+    return lambda array, k: _load(array, k)
+
+
+@overload(load_pair)
+def _overload_load_pair(array, k):
+    return lambda array, k: _load_pair(array, k)
 
 
 @overload(store)
 def _overload_store(array, k, record):
-    if array.dtype == types.float64:
-        return lambda array, k, record: _store(array, k, record)
-    return store
+    return lambda array, k, record: _store(array, k, record)
 
 
-@overload(zero)
-def _overload_zero(array):
-    if array.dtype == types.float64:
-        return lambda array: _pack(0.0, 0.0, 0.0, 0.0)
-    return lambda array: (0j, 0j, 0j, 0j)
+@overload(number)
+def _overload_number(array, k, lane):
+    return lambda array, k, lane: _number(array, k, lane)
+
+
+@overload(set_number)
+def _overload_set_number(array, k, lane, value):
+    return lambda array, k, lane, value: _set_number(array, k, lane, value)
+
+
+@overload(pair)
+def _overload_pair(a, b):
+    return lambda a, b: _pack(a, b, a, b)
+
+
+@overload(spread)
+def _overload_spread(number):
+    return lambda number: _spread(number)
 
 
 @overload(pack)
-def _overload_pack(array, a, b, c, d):
-    if array.dtype == types.float64:
-        return lambda array, a, b, c, d: _pack(a, b, c, d)
-    return lambda array, a, b, c, d: (a + 0j, b + 0j, c + 0j, d + 0j)
+def _overload_pack(a, b, c, d):
+    return lambda a, b, c, d: _pack(a, b, c, d)
 
 
-@overload(add_scaled)
-def _overload_add_scaled(s, x, y):
-    if isinstance(x, Register):
-        return lambda s, x, y: _add_scaled(s, x, y)
-    if isinstance(s, types.BaseTuple):
-        return lambda s, x, y: (
-            s[0] * x[0] + y[0],
-            s[1] * x[1] + y[1],
-            s[2] * x[2] + y[2],
-            s[3] * x[3] + y[3],
-        )
-    return lambda s, x, y: (s * x[0] + y[0], s * x[1] + y[1], s * x[2] + y[2], s * x[3] + y[3])
+@overload(blend)
+def _overload_blend(x, y):
+    return lambda x, y: _blend(x, y)
+
+
+@overload(alternate)
+def _overload_alternate(x, y):
+    return lambda x, y: _alternate(x, y)
+
+
+@overload(total)
+def _overload_total(x):
+    return lambda x: (x[0] + x[1]) + (x[2] + x[3])
+
+
+@overload(real)
+def _overload_real(x):
+    return lambda x: _real(x)
+
+
+@overload(whole)
+def _overload_whole(x):
+    return lambda x: _whole(x)
+
+
+@overload(within)
+def _overload_within(x, low, high):
+    return lambda x, low, high: _within(x, low, high)
+
+
+@overload(least)
+def _overload_least(x, y):
+    return lambda x, y: _least(x, y)
+
+
+@overload(greatest)
+def _overload_greatest(x, y):
+    return lambda x, y: _greatest(x, y)
+
+
+@overload(positive)
+def _overload_positive(x):
+    return lambda x: _positive(x)
+
+
+@overload(logarithm)
+def _overload_logarithm(x):
+    if x.dtype == types.float64:
+        return lambda x: _log(x)
+    return lambda x: _pack(np.log(x[0]), np.log(x[1]), np.log(x[2]), np.log(x[3]))
+
+
+@intrinsic
+def _atomic_add(typingctx, array, k, amount):
+    def generate(context, builder, signature, arguments):
+        pointer = _pointer(context, builder, array, arguments[0], arguments[1], ir.IntType(64))
+        return builder.atomic_rmw("add", pointer, arguments[2], "seq_cst")
+
+    return types.int64(array, types.intp, types.int64), generate
+
+
+@intrinsic
+def _atomic_load(typingctx, array, k):
+    def generate(context, builder, signature, arguments):
+        pointer = _pointer(context, builder, array, arguments[0], arguments[1], ir.IntType(64))
+        return builder.load_atomic(pointer, "seq_cst", align=8)
+
+    return types.int64(array, types.intp), generate
+
+
+# Turns of waiting before the processor is left to others, should they be more than processors.
+TURNS = 10_000
+
+
+@intrinsic
+def _give_way(typingctx):
+    name = "SwitchToThread" if sys.platform == "win32" else "sched_yield"
+
+    def generate(context, builder, signature, arguments):
+        kind = ir.FunctionType(INT32, [])
+        builder.call(cgutils.get_or_insert_function(builder.module, kind, name), [])
+        return context.get_dummy_value()
+
+    return types.none(), generate
+
+
+@overload(meet)
+def _overload_meet(meeting, threads):
+    # Number of meetings so far in meeting[8], of threads at this one in meeting[0].
+    def implementation(meeting, threads):
+        if threads == 1:
+            return
+        before = _atomic_load(meeting, 8)
+        if _atomic_add(meeting, 0, 1) == threads - 1:
+            _atomic_add(meeting, 0, -threads)
+            _atomic_add(meeting, 8, 1)
+            return
+        turns = 0
+        while _atomic_load(meeting, 8) == before:
+            turns += 1
+            if turns > TURNS:
+                _give_way()
+
+    return implementation

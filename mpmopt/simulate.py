@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -14,9 +16,13 @@ from mpmopt.checkpoints import Checkpointing, Checkpoints, Schedule
 from mpmopt.errors import DesignError, SimulationError
 from mpmopt.particles import Particles
 from mpmopt.scene import ROUNDING, Scene
+from mpmopt.threads import together
 
-# The kernel returns to Python this often, so that signals are heard in time.
-STEPS_PER_CALL = 100
+# Kernels return to Python after so many steps times particles, so that signals are heard in time.
+WORK_PER_CALL = 500_000
+# Particles in a block, at least, and blocks, at most. They, and with them the order in which nodes
+# are summed, do not depend on the number of threads.
+BLOCK, BLOCKS = 400, 64
 
 
 def world_of(scene: Scene) -> mpm.World:
@@ -125,14 +131,19 @@ class Simulation:
         self.scene = scene
         self.particles = particles
         self.world = world_of(scene)
+        actuator = mpm.grouped(particles.actuator)
         stress = [(S[0][0], S[0][1], S[1][1]) for S in (a.stress for a in scene.actuators)]
         self.body = mpm.Body(
-            volume=particles.volume.astype(dtype),
-            mass=(particles.volume * density).astype(dtype),
-            lame_lambda=np.ascontiguousarray(lame_lambda, dtype=dtype),
-            lame_mu=np.ascontiguousarray(lame_mu, dtype=dtype),
-            actuator=particles.actuator,
+            volume=mpm.grouped(particles.volume.astype(dtype), "constant"),
+            mass=mpm.grouped((particles.volume * density).astype(dtype), "constant"),
+            lame_lambda=mpm.grouped(np.asarray(lame_lambda, dtype=dtype)),
+            lame_mu=mpm.grouped(np.asarray(lame_mu, dtype=dtype)),
+            active=np.any(actuator >= 0, axis=1),
+            actuated=(actuator == np.arange(len(stress))[:, None, None]).astype(float),
             actuation_stress=np.array(stress, dtype=float).reshape(-1, 3),
+            first=np.linspace(
+                0, -(-count // 4), min(max(count // BLOCK, 1), BLOCKS) + 1, dtype=np.int64
+            ),
         )
         self.signal = np.ascontiguousarray(signal, dtype=dtype)
         self.initial = np.ascontiguousarray(state, dtype=dtype)
@@ -159,16 +170,16 @@ class Simulation:
             raise DesignError(f"frames must increase from 0 to {self.steps}, got {wanted}")
         memory = _Segment(self, 1)
         states = memory.states
-        states[0] = self.initial
+        states[0] = mpm.grouped(self.initial)
         kept = []
         step = 0
         for frame in wanted:
             while step < frame:
-                last = min(frame, step + STEPS_PER_CALL)
+                last = min(frame, step + self.steps_per_call)
                 memory.advance(step, last)
                 states[0] = states[(last - step) % 2]
                 step = last
-            kept.append(states[0].copy())
+            kept.append(mpm.ungrouped(states[0], *self.initial.shape))
         return kept[-1] if frames is None else np.array(kept)
 
     @property
@@ -176,27 +187,55 @@ class Simulation:
         """Number of steps."""
         return self.scene.steps
 
+    @property
+    def steps_per_call(self) -> int:
+        """Steps that the kernels make before they return to Python."""
+        return 1 + WORK_PER_CALL // self.initial.shape[1]
+
+    @cached_property
+    def room(self) -> tuple[int, int]:
+        """Records to start with, of the body's nodes and of a block's.
+
+        The initial windows with a quarter to spare on each axis.
+        """
+        position = np.real(self.initial[0:2])
+        most = (self.world.nodes_x, self.world.nodes_y)
+
+        def nodes(first: int, last: int) -> int:
+            cells = np.minimum(np.ptp(position[:, first:last], axis=1) / self.world.dx, most)
+            return int(np.prod(np.ceil(1.25 * cells) + 4))
+
+        first = 4 * self.body.first
+        blocks = max(nodes(a, b) for a, b in pairwise(first))
+        return nodes(0, position.shape[1]), blocks
+
     def checkpoints(self, wish: Checkpointing) -> Checkpoints:
         """A store for `forward`, with the schedule that the wish and the body's size ask for.
+
+        It holds of each segment the state (12, N) at its start; or, where all are kept, what
+        `mpm.advance` leaves of its steps.
 
         Raises
         ------
         StorageError
             If the disk has too little room.
         """
-        state, dtype = self.initial.shape, self.initial.dtype
-        nodes = _capacity(self)
-        numbers = self.initial.size + state[1] + mpm.NODE_SIZE * nodes  # state, ln J, nodes
+        groups, dtype = self.body.mass.shape[0], self.initial.dtype
+        states, log = (mpm.STATE_SIZE * groups, 4), (groups, 4)
+        nodes, _ = self.room
+        numbers = math.prod(states) + math.prod(log) + mpm.NODE_SIZE * nodes
         step_bytes = numbers * dtype.itemsize
         schedule = Schedule.choose(self.steps, step_bytes, wish)
         length = schedule.segment
-        arrays: dict[str, tuple[tuple[int, ...], DTypeLike]] = {"state": (state, dtype)}
+        arrays: dict[str, tuple[tuple[int, ...], DTypeLike]] = {
+            "state": (self.initial.shape, dtype)
+        }
         if schedule.all_stored:
             arrays = {
-                "states": ((length + 1, *state), dtype),
+                "states": ((length + 1, *states), dtype),
                 "grids": ((length, nodes, mpm.NODE_SIZE), dtype),
-                "windows": ((length, 4), np.int64),
-                "logs": ((length, state[1]), dtype),
+                "windows": ((length, len(self.body.first), 4), np.int64),
+                "logs": ((length, *log), dtype),
             }
         return Checkpoints(schedule, arrays, wish.store)
 
@@ -210,10 +249,11 @@ class Simulation:
         """
         schedule = checkpoints.schedule
         memory = _Segment(self, schedule.segment)
-        memory.states[0] = self.initial
+        memory.states[0] = mpm.grouped(self.initial)
         for index, (first, last) in enumerate(schedule.segments):
             if not schedule.all_stored:
-                checkpoints.write(index, state=memory.states[0])
+                state = mpm.ungrouped(memory.states[0], *self.initial.shape)
+                checkpoints.write(index, state=state)
             memory.advance(first, last)
             if last < schedule.steps:
                 if schedule.all_stored:
@@ -227,20 +267,21 @@ class _Segment:
 
     def __init__(self, simulation: Simulation, length: int) -> None:
         self.simulation = simulation
-        count, dtype = simulation.initial.shape[1], simulation.initial.dtype
-        self.states = np.empty((length + 1, mpm.STATE_SIZE, count), dtype)
-        self.windows = np.zeros((length, 4), np.int64)
-        self.logs = np.empty((length, count), dtype)
+        groups, dtype = simulation.body.mass.shape[0], simulation.initial.dtype
+        self.states = np.empty((length + 1, mpm.STATE_SIZE * groups, 4), dtype)
+        self.blocks = len(simulation.body.first) - 1
+        self.windows = np.zeros((length, self.blocks + 1, 4), np.int64)
+        self.logs = np.empty((length, groups, 4), dtype)
         self.grids = np.empty((length, 0, mpm.NODE_SIZE), dtype)
         self.recomputed: set[int] = set()  # segments whose windows outgrew their room in the store
-        self.resize(_capacity(simulation))
+        self.resize(*simulation.room)
 
-    def resize(self, nodes: int) -> None:
-        """Make room for windows of so many nodes, keeping the grids."""
-        kept, count = self.grids, self.states.shape[2]
+    def resize(self, nodes: int, part: int) -> None:
+        """Make room for windows of so many nodes, and so many in a block's, keeping the grids."""
+        kept = self.grids
         self.grids = np.empty((len(kept), nodes, mpm.NODE_SIZE), kept.dtype)
         self.grids[:, : kept.shape[1]] = kept
-        self.scratch = mpm.Scratch.make(count, nodes, kept.dtype)
+        self.scratch = mpm.Scratch.make(nodes, self.blocks, part, kept.dtype)
 
     def advance(self, first: int, last: int) -> None:
         """Advance from step `first`, whose state is in slot 0, to step `last`."""
@@ -248,28 +289,32 @@ class _Segment:
         signal = simulation.signal[first:last]
         reached, steps = 0, last - first
         while reached < steps:
-            reached, end, particle = mpm.advance(
+            reached, end, particle = together(
+                self.blocks,
+                mpm.advance,
                 self.states,
                 self.grids,
                 self.windows,
                 self.logs,
                 reached,
-                min(steps, reached + STEPS_PER_CALL),
+                min(steps, reached + simulation.steps_per_call),
                 simulation.body,
                 simulation.world,
                 signal,
                 self.scratch,
             )
             if end == mpm.WINDOW_TOO_SMALL:
-                self.resize(2 * self.grids.shape[1])
+                self.resize(2 * self.grids.shape[1], 2 * self.scratch.parts.shape[1])
             elif end != mpm.DONE:
-                state = self.states[reached % len(self.states)]
+                shape = simulation.initial.shape
+                particle = min(particle, shape[1] - 1)
+                state = mpm.ungrouped(self.states[reached % len(self.states)], *shape)
                 raise _failure(simulation, end, first + reached, particle, state)
 
     def store(self, index: int, checkpoints: Checkpoints) -> None:
         """Store the whole segment, or only its states if its windows outgrew their room."""
-        used = int((self.windows[:, 2] * self.windows[:, 3]).max())
-        if used > _capacity(self.simulation):
+        used = int(self.windows[:, -1, 2:].prod(axis=1).max())
+        if used > self.simulation.room[0]:
             self.recomputed.add(index)
             checkpoints.write(index, states=self.states)
         else:
@@ -281,7 +326,7 @@ class _Segment:
     def recall(self, index: int, first: int, last: int, checkpoints: Checkpoints) -> None:
         """Bring the states and nodes of a segment back: read them, or recompute them."""
         if not checkpoints.schedule.all_stored:
-            self.states[0] = checkpoints.read(index, "state")
+            self.states[0] = mpm.grouped(checkpoints.read(index, "state"))
             self.advance(first, last)
             return
         self.states[:] = checkpoints.read(index, "states")
@@ -307,7 +352,7 @@ class Forward:
         self._simulation, self._checkpoints, self._memory = simulation, checkpoints, memory
         self._reversed = False
         first, last = checkpoints.schedule.segments[-1]
-        self.state = memory.states[last - first].copy()
+        self.state = mpm.ungrouped(memory.states[last - first], *simulation.initial.shape)
 
     @property
     def recomputed_segments(self) -> int:
@@ -332,21 +377,24 @@ class Forward:
         self._reversed = True
         simulation, memory = self._simulation, self._memory
         schedule = self._checkpoints.schedule
-        bar = seed.copy()
-        body_bar = mpm.BodyBar.zeros(bar.shape[1])
-        signal_bar = np.zeros_like(simulation.signal)
+        bar, count = mpm.grouped(seed, "constant"), seed.shape[1]
+        body_bar = mpm.BodyBar.zeros(len(simulation.body.mass))
+        blocks = memory.blocks
+        signal_bar = np.zeros((blocks, *simulation.signal.shape))
         segments = schedule.segments
         for index in range(len(segments) - 1, -1, -1):
             first, last = segments[index]
             if last < schedule.steps:
                 memory.recall(index, first, last, self._checkpoints)
-            for stop in range(last - first, 0, -STEPS_PER_CALL):
-                mpm.advance_adjoint(
+            for stop in range(last - first, 0, -simulation.steps_per_call):
+                together(
+                    blocks,
+                    mpm.advance_adjoint,
                     memory.states,
                     memory.grids,
                     memory.windows,
                     memory.logs,
-                    max(0, stop - STEPS_PER_CALL),
+                    max(0, stop - simulation.steps_per_call),
                     stop,
                     simulation.body,
                     simulation.world,
@@ -354,23 +402,15 @@ class Forward:
                     memory.scratch,
                     bar,
                     body_bar,
-                    signal_bar[first:last],
+                    signal_bar[:, first:last],
                 )
         return Gradient(
-            density=simulation.particles.volume * body_bar.mass,
-            lame_lambda=body_bar.lame_lambda,
-            lame_mu=body_bar.lame_mu,
-            signal=signal_bar,
-            state=bar,
+            density=simulation.particles.volume * mpm.ungrouped(body_bar.mass, 1, count)[0],
+            lame_lambda=mpm.ungrouped(body_bar.lame_lambda, 1, count)[0],
+            lame_mu=mpm.ungrouped(body_bar.lame_mu, 1, count)[0],
+            signal=signal_bar.sum(axis=0),
+            state=mpm.ungrouped(bar, mpm.STATE_SIZE, count),
         )
-
-
-def _capacity(simulation: Simulation) -> int:
-    """Node records to start with: the initial window with a quarter to spare on each axis."""
-    position = np.real(simulation.initial[0:2])
-    cells = np.ptp(position, axis=1) / simulation.world.dx
-    cells = np.minimum(cells, (simulation.world.nodes_x, simulation.world.nodes_y))
-    return int(np.prod(np.ceil(1.25 * cells) + 4))
 
 
 def _failure(

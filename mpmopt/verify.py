@@ -135,6 +135,10 @@ def kernel_mismatches(scene: Scene, seed: int = 0) -> dict[str, float]:
     return result
 
 
+# Names of what the stress depends on, and of the fields of `mpm.Body`.
+CONSTANTS = {"mass": "mass", "la": "lame_lambda", "mu": "lame_mu"}
+
+
 class _Bench:
     """Kernels and their adjoints as functions of named arrays, on a roughly moving body."""
 
@@ -163,32 +167,43 @@ class _Bench:
             self.state,
         )
         self.body = sample.body
-        *window, outside = mpm.find_window(self.state, self.world)
-        if outside >= 0:
-            raise DesignError(f"particle {outside} is outside the grid")
+        groups = len(self.body.mass)
+        self.all = (0, groups)
+        *window, inside = mpm.find_window(mpm.grouped(self.state), self.world, *self.all)
+        if not inside:
+            raise DesignError("a particle is outside the grid")
         self.window = tuple(window)
         self.nodes = window[2] * window[3]
-        grid = np.zeros((self.nodes, mpm.NODE_SIZE))
-        scratch = self._scratch(float)
-        scratch.affine[:] = rng.standard_normal((4, count)) * np.mean(self.body.mass) * speed
-        mpm.p2g(self.state, self.body, self.world, scratch, self.window, grid)
-        self.mass_grid = grid[:, 2].copy()
+        affine = rng.standard_normal((4, count)) * np.mean(sample.body.mass) * speed
         self.inputs: Arrays = {
             "position": self.state[0:2],
             "velocity": self.state[2:4],
             "affine_velocity": self.state[4:8],
             "deformation": self.state[8:12],
-            "mass": self.body.mass,
-            "la": self.body.lame_lambda,
-            "mu": self.body.lame_mu,
+            **{
+                short: mpm.ungrouped(getattr(self.body, name), 1, count)
+                for short, name in CONSTANTS.items()
+            },
             "signal": np.full(len(scene.actuators), 0.7),
-            "affine": scratch.affine.copy(),
-            "grid": grid[:, :3][grid[:, 2] > 0.0],
+            "affine": affine,
             "node_velocity": speed * rng.standard_normal((self.nodes, 2)),
         }
+        grid = self.p2g(self.inputs)["grid"]
+        self.mass_grid = grid[:, 2]
+        self.inputs["grid"] = grid[grid[:, 2] > 0.0]
+
+    def _tile(self, records: NDArray) -> mpm.Tile:
+        """Of all groups, located."""
+        tile = mpm.make_tile(self.all[1], records)
+        mpm.locate(records, self.world, tile, *self.all)
+        mpm.locate_adjoint(records, self.world, tile, *self.all)
+        return tile
 
     def _scratch(self, dtype: type) -> mpm.Scratch:
-        return mpm.Scratch.make(self.state.shape[1], self.nodes, dtype)
+        return mpm.Scratch.make(self.nodes, 1, self.nodes, dtype)
+
+    def _particles(self, records: NDArray, rows: int) -> NDArray:
+        return mpm.ungrouped(records, rows, self.state.shape[1])
 
     def _state(self, v: Arrays, dtype: type) -> NDArray:
         state: NDArray = self.state.astype(dtype)
@@ -200,82 +215,89 @@ class _Bench:
         ):
             if name in v:
                 state[rows] = v[name]
-        return state
+        return mpm.grouped(state)
 
     def _body(self, v: Arrays, dtype: type) -> mpm.Body:
-        named = {"mass": "mass", "la": "lame_lambda", "mu": "lame_mu"}
-        arrays = {full: v[short] for short, full in named.items() if short in v}
-        body = self.body._replace(**arrays)
-        floats = ("volume", "mass", "lame_lambda", "lame_mu")
+        body = self.body._replace(
+            **{
+                name: mpm.grouped(v[short], "constant")
+                for short, name in CONSTANTS.items()
+                if short in v
+            }
+        )
+        floats = ("volume", *CONSTANTS.values())
         return body._replace(**{name: getattr(body, name).astype(dtype) for name in floats})
 
     def deform(self, v: Arrays) -> Arrays:
         old = self._state(v, np.result_type(*v.values()).type)
-        new, log_J = old.copy(), np.zeros_like(old[0])
-        mpm.deform(old, new, self.world, log_J)
-        return {"new": new[8:12]}
+        new, log_J = old.copy(), np.zeros((self.all[1], 4), old.dtype)
+        mpm.deform(old, new, self.world, log_J, *self.all)
+        return {"new": self._particles(new, 12)[8:12]}
 
     def deform_adjoint(self, v: Arrays, w: Arrays) -> Arrays:
         old = self._state(v, float)
-        bar = np.zeros_like(old)
-        bar[8:12] = w["new"]
-        mpm.deform_adjoint(old, self.world, bar)
+        bar = self._bar(8, w["new"])
+        mpm.deform_adjoint(old, self.world, bar, *self.all)
+        bar = self._particles(bar, 12)
         return {"affine_velocity": bar[4:8], "deformation": bar[8:12]}
+
+    def _bar(self, row: int, values: NDArray) -> NDArray:
+        """Adjoint of a state of which only some rows are not zero."""
+        bar = np.zeros_like(self.state)
+        bar[row : row + len(values)] = values
+        return mpm.grouped(bar, "constant")
+
+    def _body_bar(self) -> mpm.BodyBar:
+        return mpm.BodyBar.zeros(self.all[1])
 
     def stress(self, v: Arrays) -> Arrays:
         # Here the deformation gradient is the new one, on which the stress depends.
         dtype = np.result_type(*v.values()).type
-        state, scratch = self._state(v, dtype), self._scratch(dtype)
-        mpm.stress(
-            state,
-            state,
-            _log_jacobian(state),
-            self._body(v, dtype),
-            self.world,
-            v["signal"],
-            scratch,
-        )
-        return {"affine": scratch.affine}
+        state, body = self._state(v, dtype), self._body(v, dtype)
+        tile, log_J = self._tile(state), _log_jacobian(state)
+        mpm.stress(state, state, log_J, body, self.world, v["signal"], tile, *self.all)
+        return {"affine": self._particles(tile.affine, 4)}
 
     def stress_adjoint(self, v: Arrays, w: Arrays) -> Arrays:
-        state, scratch, body = self._state(v, float), self._scratch(float), self._body(v, float)
-        bar, body_bar, signal_bar = (
-            np.zeros_like(state),
-            mpm.BodyBar.zeros(self.state.shape[1]),
-            0.0 * v["signal"],
-        )
-        scratch.affine_bar[:] = w["affine"]
-        given = (state, state, _log_jacobian(state), body, self.world, v["signal"])
-        mpm.stress_adjoint(*given, scratch, bar, body_bar, signal_bar)
+        state, body = self._state(v, float), self._body(v, float)
+        tile, log_J = self._tile(state), _log_jacobian(state)
+        bar, body_bar = np.zeros_like(state), self._body_bar()
+        signal_bar = 0.0 * v["signal"]
+        gathered = np.zeros((8, self.state.shape[1]))
+        gathered[:4] = w["affine"]
+        tile.gathered[:] = mpm.grouped(gathered, "constant")
+        given = (state, state, log_J, body, self.world, v["signal"], tile)
+        mpm.stress_adjoint(*given, bar, body_bar, signal_bar, *self.all)
+        bar = self._particles(bar, 12)
         return {
             "affine_velocity": bar[4:8],
             "deformation": bar[8:12],
-            "mass": body_bar.mass,
-            "la": body_bar.lame_lambda,
-            "mu": body_bar.lame_mu,
+            **{short: self._particles(getattr(body_bar, n), 1) for short, n in CONSTANTS.items()},
             "signal": signal_bar,
         }
 
     def p2g(self, v: Arrays) -> Arrays:
         dtype = np.result_type(*v.values()).type
-        scratch, grid = self._scratch(dtype), np.zeros((self.nodes, mpm.NODE_SIZE), dtype)
-        scratch.affine[:] = v["affine"]
         state, body = self._state(v, dtype), self._body(v, dtype)
-        mpm.p2g(state, body, self.world, scratch, self.window, grid)
+        tile, grid = self._tile(state), np.zeros((self.nodes, mpm.NODE_SIZE), dtype)
+        tile.affine[:] = mpm.grouped(v["affine"])
+        mpm.p2g(state, body, self.world, tile, self.window, grid, *self.all)
         return {"grid": grid[:, :3]}
 
     def p2g_adjoint(self, v: Arrays, w: Arrays) -> Arrays:
-        scratch, body_bar = self._scratch(float), mpm.BodyBar.zeros(self.state.shape[1])
-        bar = np.zeros_like(self.state)
-        scratch.affine[:] = v["affine"]
-        scratch.node_bar[:, :3] = w["grid"]
         state, body = self._state(v, float), self._body(v, float)
-        mpm.p2g_adjoint(state, body, self.world, scratch, self.window, bar, body_bar)
+        tile, scratch, body_bar = self._tile(state), self._scratch(float), self._body_bar()
+        bar = np.zeros_like(state)
+        tile.affine[:] = mpm.grouped(v["affine"])
+        scratch.node_bar[:, :3] = w["grid"]
+        given = (state, body, self.world, tile, scratch, self.window)
+        mpm.p2g_adjoint(*given, bar, body_bar, *self.all)
+        bar = self._particles(bar, 12)
         return {
             "position": bar[0:2],
             "velocity": bar[2:4],
-            "affine": scratch.affine_bar,
-            "mass": body_bar.mass,
+            "affine": self._particles(tile.gathered, 8)[:4],
+            "mass": self._particles(body_bar.mass, 1),
         }
 
     def mirror(self, v: Arrays) -> Arrays:
@@ -291,36 +313,40 @@ class _Bench:
 
     def grid_update(self, v: Arrays) -> Arrays:
         dtype = np.result_type(*v.values()).type
-        scratch = self._scratch(dtype)
-        mpm.grid_update(self._grid(v, dtype), self.window, self.world, scratch)
+        scratch, grid = self._scratch(dtype), self._grid(v, dtype)
+        for column in range(self.window[2]):
+            mpm.grid_update(grid, self.window, self.world, scratch, column)
         return {"velocity": scratch.velocity[:, :2]}
 
     def grid_update_adjoint(self, v: Arrays, w: Arrays) -> Arrays:
-        scratch = self._scratch(float)
+        scratch, grid = self._scratch(float), self._grid(v, float)
         scratch.velocity_bar[:, :2] = w["velocity"]
-        mpm.grid_update_adjoint(self._grid(v, float), self.window, self.world, scratch)
+        for column in range(self.window[2]):
+            mpm.grid_update_adjoint(grid, self.window, self.world, scratch, column)
         return {"grid": scratch.node_bar[:, :3][self.mass_grid > 0.0]}
 
     def g2p(self, v: Arrays) -> Arrays:
+        return {"new": self._particles(self._after_g2p(v)[1], 12)[0:8]}
+
+    def _after_g2p(self, v: Arrays) -> tuple[NDArray, NDArray, mpm.Scratch]:
         dtype = np.result_type(*v.values()).type
         old, scratch = self._state(v, dtype), self._scratch(dtype)
         new = np.zeros_like(old)
-        scratch.velocity[:] = np.hstack([v["node_velocity"]] * 2)
-        mpm.g2p(old, new, self.world, scratch, self.window)
-        return {"new": new[0:8]}
+        scratch.velocity[:, :2] = v["node_velocity"]
+        mpm.g2p(old, new, self.world, self._tile(old), scratch, self.window, *self.all)
+        return old, new, scratch
 
     def g2p_adjoint(self, v: Arrays, w: Arrays) -> Arrays:
-        old, scratch = self._state(v, float), self._scratch(float)
-        new, bar = np.zeros_like(old), np.zeros_like(old)
-        scratch.velocity[:] = np.hstack([v["node_velocity"]] * 2)
-        mpm.g2p(old, new, self.world, scratch, self.window)
-        bar[0:8] = w["new"]
-        mpm.g2p_adjoint(old, new, self.world, scratch, self.window, bar)
-        return {"position": bar[0:2], "node_velocity": scratch.velocity_bar[:, :2]}
+        old, new, scratch = self._after_g2p(v)
+        bar, part = self._bar(0, w["new"]), scratch.parts[0]
+        given = (old, new, self.world, self._tile(old), scratch, self.window)
+        mpm.g2p_adjoint(*given, bar, self.window, part, *self.all)
+        return {"position": self._particles(bar, 12)[0:2], "node_velocity": part[:, :2]}
 
 
-def _log_jacobian(state: NDArray) -> NDArray:
-    return np.log(state[8] * state[11] - state[9] * state[10])
+def _log_jacobian(records: NDArray) -> NDArray:
+    f = [records[row::12] for row in range(8, 12)]
+    return np.log(f[0] * f[3] - f[1] * f[2])
 
 
 class ComplexStep(NamedTuple):

@@ -188,24 +188,31 @@ def manufactured_error(n, amplitude, courant=0.2, per_cell=2):
     old[2:4] = amplitude * sine * rate
     old[4], old[7] = amplitude * np.pi * cosine * rate
     old[8], old[11] = 1.0 / (1.0 + dt * old[4]), 1.0 / (1.0 + dt * old[7])
+    shape, groups, side = old.shape, len(body.mass), n + 7
+    every, window = (0, groups), (0, 0, side, side)
+    old = mpm.grouped(old)
     new = old.copy()
-    side, count = n + 7, X.shape[1]
-    window = (0, 0, side, side)
     grid = np.zeros((side * side, mpm.NODE_SIZE))
-    scratch, log_J = mpm.Scratch.make(count, side * side), np.zeros(count)
+    scratch, tile = mpm.Scratch.make(side * side, 1, 0), mpm.make_tile(groups, old)
+    log_J = np.zeros((groups, 4))
     worst = 0.0
     for step in range(steps):
-        old[2:4] += dt * force(step * dt)
-        mpm.deform(old, new, world, log_J)
-        mpm.stress(old, new, log_J, body, world, np.zeros(0), scratch)
-        mpm.p2g(old, body, world, scratch, window, grid)
+        push = dt * force(step * dt)
+        old[2::12] += mpm.grouped(push[:1])
+        old[3::12] += mpm.grouped(push[1:])
+        mpm.deform(old, new, world, log_J, *every)
+        mpm.locate(old, world, tile, *every)
+        mpm.stress(old, new, log_J, body, world, np.zeros(0), tile, *every)
+        grid[:] = 0.0
+        mpm.p2g(old, body, world, tile, window, grid, *every)
         mirror(grid.reshape(side, side, 4), 0, n)
         mirror(grid.reshape(side, side, 4).transpose(1, 0, 2), 1, n)
-        mpm.grid_update(grid, window, world, scratch)
-        mpm.g2p(old, new, world, scratch, window)
+        for column in range(side):
+            mpm.grid_update(grid, window, world, scratch, column)
+        mpm.g2p(old, new, world, tile, scratch, window, *every)
         old, new = new, old
         u, _ = exact((step + 1) * dt)
-        error = old[0:2] - offset - X - u
+        error = mpm.ungrouped(old, *shape)[0:2] - offset - X - u
         worst = max(worst, math.sqrt((error**2).sum(axis=0).mean()) / amplitude)
     return worst
 

@@ -17,29 +17,27 @@ from mpmopt.problem import Problem
 
 # What is replaced in mpm.py, by a name of the fault. Each stands in an adjoint kernel.
 FAULTS = {
-    "sign of the position's weight slope": (
-        "s_w = add_scaled(slope_x[a], row_w, s_w)",
-        "s_w = add_scaled(-slope_x[a], row_w, s_w)",
+    "sign of the weights' slope": ("return (f - 1.5) / dx,", "return (1.5 - f) / dx,"),
+    "slopes where weights belong": (
+        "blends(w_y, s_y), blends(s_x, w_x)\n            v_bar",
+        "blends(s_y, w_y), blends(w_x, s_x)\n            v_bar",
     ),
-    "C_bar transposed in the position": ("- (c00 * u + c10 * v)", "- (c00 * u + c01 * v)"),
-    "position through the affine momentum": ("- (a00 * ww[0] + a10 * ww[1])", "- 0.0"),
+    "C_bar transposed in the position": ("- c00 * u - c10 * v)", "- c00 * u - c01 * v)"),
+    "position through the affine momentum": ("- a00 * qx_bar - a10 * qy_bar)", ")"),
     "affine momentum transposed": (
-        "wr_w[0], w_wr[0], wr_w[1], w_wr[1]",
-        "wr_w[0], wr_w[1], w_wr[0], w_wr[1]",
+        "gathered, 8 * t + 1, k, mean[2])",
+        "gathered, 8 * t + 1, k, along[1])",
     ),
-    "mass in the momentum": ("ww[2] + v[0, p] * ww[0] + v[1, p] * ww[1]", "ww[2]"),
+    "mass in the momentum": ("+ u * qx_bar + v * qy_bar)", ")"),
     "mass of a node": ("(u_bar * qx + v_bar * qy) / (m * m)", "(u_bar * qx + v_bar * qy) / m"),
-    "step in the velocity": ("u_bar = bar[2, p] + world.dt * bar[0, p]", "u_bar = bar[2, p]"),
-    "pressure": ("+ pressure * f11\n        b01", "- pressure * f11\n        b01"),
+    "step in the velocity": ("add(bar, 12 * g + 2, dt * x_bar)", "pass"),
+    "pressure": ("t01 * h10 + pressure * f11", "t01 * h10 - pressure * f11"),
     "shear counted once": ("impulse * (a01 + a10)", "impulse * a01"),
-    "lambda": ("trace * log_J[p]", "trace"),
-    "actuation in F": ("b00 += s * (2.0 * t00 * g00", "b00 += s * (t00 * g00"),
-    "signal": ("+ t11 * (g10 * f10 + g11 * f11)", "- t11 * (g10 * f10 + g11 * f11)"),
-    "C transposed": ("dt * (b00 * f10 + b01 * f11)", "dt * (b10 * f00 + b11 * f01)"),
-    "old deformation gradient": (
-        "F_bar[0, p] = b00 + dt * (c00 * b00 + c10 * b10)",
-        "F_bar[0, p] = b00",
-    ),
+    "lambda": ("trace * load(log_J, g)", "trace"),
+    "actuation in F": ("h00 + f00 * s00 + f01 * s01", "h00 + f00 * s00"),
+    "signal": ("power + t11 *", "power - t11 *"),
+    "C transposed": ("d01 + dt * (b00 * f10 + b01 * f11)", "d01 + dt * (b10 * f00 + b11 * f01)"),
+    "old deformation gradient": ("b00 + dt * (c00 * b00 + c10 * b10)", "b00"),
 }
 WALL_FAULT = ("u_bar, v_bar = wall_adjoint(", "u_bar, v_bar = (lambda *args: args[-2:])(")
 
