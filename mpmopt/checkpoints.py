@@ -166,6 +166,7 @@ class Checkpoints:
                 name, "w", driver="core", backing_store=False, block_size=MEGABYTE
             )
             self._lay_out(arrays)
+            self._datasets = dict(self._file)
             return
         if self._target is not None and self._target.exists() and not _is_store(self._target):
             raise StorageError(
@@ -185,6 +186,7 @@ class Checkpoints:
                 self._lay_out(arrays)
             self._take_room(self.path.stat().st_size)
             self._file = h5py.File(self.path, "r+")
+            self._datasets = dict(self._file)
         except OSError as error:
             self._remove()
             raise StorageError(
@@ -217,7 +219,7 @@ class Checkpoints:
         """Store named arrays of a segment; they may be shorter than the room for them."""
         for name, array in arrays.items():
             where = (segment, *map(slice, array.shape))
-            self._file[name][where] = array
+            self._datasets[name][where] = array
 
     def read(self, segment: int, name: str) -> NDArray:
         """An array of a segment, with all the room that it has.
@@ -228,7 +230,7 @@ class Checkpoints:
             If the file lost it.
         """
         try:
-            return np.asarray(self._file[name][segment])
+            return np.asarray(self._datasets[name][segment])
         except (OSError, KeyError, RuntimeError) as error:
             raise StorageError(
                 f"cannot read {name} of segment {segment} back from {self.path or 'memory'}: "

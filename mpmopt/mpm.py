@@ -36,7 +36,7 @@ import functools
 import math
 import operator
 import sys
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from llvmlite import ir
@@ -892,20 +892,23 @@ def first_outside(state, world, first, last):
     return -1
 
 
-def grouped(array: NDArray, mode: Literal["edge", "constant"] = "edge") -> NDArray:
+def grouped(array: NDArray, repeat: bool = True) -> NDArray:
     """R numbers (R, N) of N particles as records (R G, 4) of groups of four; (N,) as (G, 4).
 
-    Repeats of the last particle, or zeros, fill the last group.
+    The last group is filled with repeats of the last particle, or with zeros.
     """
     rows = np.atleast_2d(array)
-    filled = np.pad(rows, [(0, 0), (0, -rows.shape[1] % 4)], mode)
-    return np.ascontiguousarray(np.moveaxis(filled.reshape(len(rows), -1, 4), 1, 0)).reshape(-1, 4)
+    count, groups = rows.shape[1], -(-rows.shape[1] // 4)
+    filled = np.empty((len(rows), 4 * groups), rows.dtype)
+    filled[:, :count] = rows
+    filled[:, count:] = rows[:, -1:] if repeat else 0.0
+    return filled.reshape(-1, groups, 4).swapaxes(0, 1).reshape(-1, 4)
 
 
 def ungrouped(records: NDArray, rows: int, particles: int) -> NDArray:
     """The inverse of `grouped`: (rows, particles)."""
-    parts = np.moveaxis(records.reshape(-1, rows, 4), 0, 1)
-    return parts.reshape(rows, -1)[:, :particles].copy()
+    filled = records.reshape(-1, rows, 4).swapaxes(0, 1).reshape(rows, -1)
+    return np.ascontiguousarray(filled[:, :particles])
 
 
 # Records of four numbers: of a node, or one number of four particles in a row. These functions on

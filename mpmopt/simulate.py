@@ -134,8 +134,8 @@ class Simulation:
         actuator = mpm.grouped(particles.actuator)
         stress = [(S[0][0], S[0][1], S[1][1]) for S in (a.stress for a in scene.actuators)]
         self.body = mpm.Body(
-            volume=mpm.grouped(particles.volume.astype(dtype), "constant"),
-            mass=mpm.grouped((particles.volume * density).astype(dtype), "constant"),
+            volume=mpm.grouped(particles.volume.astype(dtype), repeat=False),
+            mass=mpm.grouped((particles.volume * density).astype(dtype), repeat=False),
             lame_lambda=mpm.grouped(np.asarray(lame_lambda, dtype=dtype)),
             lame_mu=mpm.grouped(np.asarray(lame_mu, dtype=dtype)),
             active=np.any(actuator >= 0, axis=1),
@@ -377,7 +377,7 @@ class Forward:
         self._reversed = True
         simulation, memory = self._simulation, self._memory
         schedule = self._checkpoints.schedule
-        bar, count = mpm.grouped(seed, "constant"), seed.shape[1]
+        bar, count = mpm.grouped(seed, repeat=False), seed.shape[1]
         body_bar = mpm.BodyBar.zeros(len(simulation.body.mass))
         blocks = memory.blocks
         signal_bar = np.zeros((blocks, *simulation.signal.shape))

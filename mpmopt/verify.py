@@ -220,7 +220,7 @@ class _Bench:
     def _body(self, v: Arrays, dtype: type) -> mpm.Body:
         body = self.body._replace(
             **{
-                name: mpm.grouped(v[short], "constant")
+                name: mpm.grouped(v[short], repeat=False)
                 for short, name in CONSTANTS.items()
                 if short in v
             }
@@ -245,7 +245,7 @@ class _Bench:
         """Adjoint of a state of which only some rows are not zero."""
         bar = np.zeros_like(self.state)
         bar[row : row + len(values)] = values
-        return mpm.grouped(bar, "constant")
+        return mpm.grouped(bar, repeat=False)
 
     def _body_bar(self) -> mpm.BodyBar:
         return mpm.BodyBar.zeros(self.all[1])
@@ -265,7 +265,7 @@ class _Bench:
         signal_bar = 0.0 * v["signal"]
         gathered = np.zeros((8, self.state.shape[1]))
         gathered[:4] = w["affine"]
-        tile.gathered[:] = mpm.grouped(gathered, "constant")
+        tile.gathered[:] = mpm.grouped(gathered, repeat=False)
         given = (state, state, log_J, body, self.world, v["signal"], tile)
         mpm.stress_adjoint(*given, bar, body_bar, signal_bar, *self.all)
         bar = self._particles(bar, 12)
