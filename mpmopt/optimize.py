@@ -46,6 +46,8 @@ class Stage:
         How many of the scene's cells go into the width of this stage's: early stages need no more.
     move_limit : float
         Greatest step of a variable, as a fraction of its range.
+    leave_out : float
+        Design particles whose gamma is below this are not simulated (`Problem`).
 
     Raises
     ------
@@ -60,6 +62,7 @@ class Stage:
     solid: bool = False
     coarsening: int = 1
     move_limit: float = 0.05
+    leave_out: float = 0.0
 
     def __post_init__(self) -> None:
         for name in ("beta", "mass_floor", "stiffness_floor", "time_step", "move_limit"):
@@ -67,6 +70,10 @@ class Stage:
             object.__setattr__(self, name, value)
         if self.move_limit > 1.0:
             raise DesignError(f"Stage: move_limit = {self.move_limit} must be at most 1")
+        leave_out = number("Stage", "leave_out", self.leave_out, error=DesignError)
+        if not 0.0 <= leave_out < 1.0:
+            raise DesignError(f"Stage: leave_out = {leave_out} must be at least 0 and below 1")
+        object.__setattr__(self, "leave_out", leave_out)
         coarsening = count("Stage", "coarsening", self.coarsening, 1, error=DesignError)
         object.__setattr__(self, "coarsening", coarsening)
 
@@ -79,9 +86,15 @@ class Stage:
             coarsening=self.coarsening,
         )
 
-    def problem(self, scene: Scene, time_step: float) -> Problem:
-        """The problem that this stage solves, in the time step that it ended with."""
-        return Problem(dataclasses.replace(self, time_step=time_step).scene(scene), self.beta)
+    def problem(
+        self,
+        scene: Scene,
+        time_step: float | None = None,
+        checkpointing: Checkpointing | None = None,
+    ) -> Problem:
+        """The problem that this stage solves, in another time step if it ended with one."""
+        stage = self if time_step is None else dataclasses.replace(self, time_step=time_step)
+        return Problem(stage.scene(scene), self.beta, checkpointing, self.leave_out)
 
 
 @dataclass(frozen=True)
@@ -374,7 +387,7 @@ class _StageRun:
     def __init__(self, whole: _Climb, index: int, start: int) -> None:
         self.whole, self.run, self.index, self.start = whole, whole.run, index, start
         self.stage = self.run.settings.stages[index]
-        self.problem = Problem(whole.scenes[index], self.stage.beta, whole.checkpointing)
+        self.problem = self.stage.problem(self.run.scene, None, whole.checkpointing)
         self.best_merit: tuple[float, ...] | None = None
         self.best_gradient: NDArray[np.float64] | None = None
 
@@ -470,8 +483,8 @@ class _StageRun:
     def _halve_time_step(self) -> None:
         scene = self.problem.scene
         logger.warning("no design of this stage ran yet: time step %g halved", scene.time_step)
-        self.problem = Problem(
-            scene.vary(time_step=scene.time_step / 2.0), self.stage.beta, self.whole.checkpointing
+        self.problem = self.stage.problem(
+            self.run.scene, scene.time_step / 2.0, self.whole.checkpointing
         )
 
     def _stop_reason(self, values: list[float]) -> str:

@@ -133,7 +133,8 @@ def plot_design(path: Path, problem: Problem, x: NDArray[np.float64], title: str
     """Write a PNG of a design in motion: grey is gamma, red and blue the actuation's sign."""
     gamma = np.ones(len(problem.particles.position))
     gamma[problem.particles.designed] = problem.gamma(x)
-    plot_motion(path, problem.simulation(x), gamma, title)
+    present = problem.present(problem.split(x).phi)
+    plot_motion(path, problem.simulation(x), gamma[present], title)
 
 
 def plot_history(path: Path, run: Optimisation) -> None:

@@ -52,6 +52,10 @@ class Problem:
     beta : float, optional
         Sharpness of the projection.
     checkpointing : Checkpointing, optional
+    leave_out : float, optional
+        Design particles whose gamma is below this are not simulated. Their void weighs nothing
+        then, cannot be flung about, and costs no time; they return when the filter brings them
+        back. The objective jumps where gamma crosses this; its gradient is that between jumps.
 
     Attributes
     ----------
@@ -62,13 +66,17 @@ class Problem:
     """
 
     def __init__(
-        self, scene: Scene, beta: float = 1.0, checkpointing: Checkpointing | None = None
+        self,
+        scene: Scene,
+        beta: float = 1.0,
+        checkpointing: Checkpointing | None = None,
+        leave_out: float = 0.0,
     ) -> None:
         self.scene = scene
+        self.leave_out = leave_out
         self.checkpointing = checkpointing or Checkpointing()
         self.particles = lay_out(scene)
         self.chain = DesignChain(scene, self.particles, beta)
-        self.objective = Objective.of(self.particles, scene.direction)
         self._designed = int(self.particles.designed.sum())
         self.size = self._designed + 3 * len(scene.actuators)
 
@@ -122,15 +130,29 @@ class Problem:
         """Material density (D,) of the design particles."""
         return self.chain.gamma(self.split(x).phi)
 
+    def present(self, phi: NDArray) -> NDArray[np.bool_]:
+        """Which of all particles are simulated (N,)."""
+        present = np.ones(len(self.particles.position), dtype=bool)
+        present[self.particles.designed] = self.chain.gamma(phi).real >= self.leave_out
+        return present
+
     def simulation(self, x: NDArray) -> Simulation:
         """The simulation of a design."""
         phi, a, theta, b = self.split(x)
+        present = self.present(phi)
+        density, lame_lambda, lame_mu = (each[present] for each in self.chain.material(phi))
         return Simulation(
             self.scene,
-            self.particles,
-            *self.chain.material(phi),
-            signal=signal(self.scene, a, theta, b),
+            self.particles.subset(present),
+            density,
+            lame_lambda,
+            lame_mu,
+            signal(self.scene, a, theta, b),
         )
+
+    def objective(self, simulation: Simulation) -> Objective:
+        """How far the body of one of this problem's simulations goes."""
+        return Objective.of(simulation.particles, self.scene.direction)
 
     def value(self, x: NDArray) -> Any:
         """Objective L of a design, larger is farther; complex if x is complex.
@@ -143,7 +165,7 @@ class Problem:
             If the simulation fails.
         """
         simulation = self.simulation(x)
-        return _finite(self.objective.value(simulation.run()), simulation)
+        return _finite(self.objective(simulation).value(simulation.run()), simulation)
 
     def value_and_gradient(self, x: NDArray) -> tuple[float, NDArray[np.float64]]:
         """Objective L and its gradient (D + 3 K,), by the reverse loop.
@@ -159,11 +181,14 @@ class Problem:
         simulation = self.simulation(x)
         with simulation.checkpoints(self.checkpointing) as checkpoints:
             forward = simulation.forward(checkpoints)
-            value = float(_finite(self.objective.value(forward.state), simulation))
-            bars = forward.reverse(self.objective.seed(forward.state))
-        phi_bar = self.chain.pullback(phi, bars.density, bars.lame_lambda, bars.lame_mu)
-        gradient = np.concatenate([phi_bar, *signal_adjoint(self.scene, a, theta, bars.signal)])
-        return value, _finite(gradient, simulation)
+            objective = self.objective(simulation)
+            value = float(_finite(objective.value(forward.state), simulation))
+            gradient = forward.reverse(objective.seed(forward.state))
+        bars = np.zeros((3, len(self.particles.position)))
+        bars[:, self.present(phi)] = gradient.density, gradient.lame_lambda, gradient.lame_mu
+        phi_bar = self.chain.pullback(phi, *bars)
+        parts = phi_bar, *signal_adjoint(self.scene, a, theta, gradient.signal)
+        return value, _finite(np.concatenate(parts), simulation)
 
 
 def _real(name: str, value: Any) -> NDArray[np.float64]:

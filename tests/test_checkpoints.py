@@ -222,7 +222,7 @@ def test_going_back_twice_is_refused(rough_walker, every):
     simulation = problem.simulation(x)
     with simulation.checkpoints(Checkpointing(every)) as checkpoints:
         forward = simulation.forward(checkpoints)
-        seed = problem.objective.seed(forward.state)
+        seed = problem.objective(simulation).seed(forward.state)
         forward.reverse(seed)
         with pytest.raises(DesignError, match="run forward again"):
             forward.reverse(seed)

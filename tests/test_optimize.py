@@ -228,6 +228,8 @@ def test_a_stage_that_never_runs_gives_up_after_three_halvings(scene, start, mon
         {"move_limit": 1.5},
         {"move_limit": "a"},
         {"coarsening": 1.5},
+        {"leave_out": -0.1},
+        {"leave_out": 1.0},
     ],
 )
 def test_senseless_stages_are_refused(wrong):

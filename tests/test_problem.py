@@ -50,6 +50,24 @@ def test_gradient_in_a_slanted_direction_and_three_particles_a_cell():
     assert worst(complex_step_test(problem, x)) <= COMPLEX_TOLERANCE
 
 
+def test_void_that_is_left_out_is_not_simulated_and_the_gradient_stays_exact(problem, x):
+    gamma = problem.gamma(x)
+    leave_out = float(np.median(gamma))
+    part = Problem(problem.scene, problem.chain.beta, leave_out=leave_out)
+    simulation = part.simulation(x)
+    fewer = (gamma < leave_out).sum()
+    assert len(simulation.particles.position) == len(part.particles.position) - fewer
+    assert 10 <= fewer < gamma.size
+    assert worst(complex_step_test(part, x, directions=3)) <= COMPLEX_TOLERANCE
+    # Void that weighs nothing does nothing; left out, it changes nothing.
+    light = problem.scene.vary(mass_floor=1e-9, stiffness_floor=1e-9)
+    sharp = problem.join(np.where(gamma > leave_out, 1.0, -1.0), [0.9, 0.5], 0.2, 0.1)
+    with_void = Problem(dataclasses.replace(light, steps=5), 32.0)
+    without = Problem(dataclasses.replace(light, steps=5), 32.0, leave_out=1e-4)
+    assert without.simulation(sharp).initial.size < with_void.simulation(sharp).initial.size
+    assert without.value(sharp) == pytest.approx(with_void.value(sharp), rel=1e-7)
+
+
 def test_value_is_that_of_value_and_gradient(problem, x):
     value, gradient = problem.value_and_gradient(x)
     assert problem.value(x) == value
