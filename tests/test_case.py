@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -143,8 +144,8 @@ def test_the_walkers_settings_are_those_of_the_design():
             stage.scene(case.scene)
 
 
-def start_up(tmp_path, what):
-    environment = {**os.environ, "PYTHONPATH": f"{ROOT}:{ROOT}/cases"}
+def start_up(tmp_path, what, root=ROOT):
+    environment = {**os.environ, "PYTHONPATH": f"{root}:{ROOT}/cases"}
     done = subprocess.run(
         [sys.executable, "-c", what], capture_output=True, text=True, env=environment,
         timeout=120, cwd=tmp_path,
@@ -181,6 +182,32 @@ def test_a_second_start_takes_its_kernels_from_the_cache_to_the_same_bits(tmp_pa
     warm, *loaded = start_up(tmp_path, GRADIENT)
     assert loaded == ["1", "1", "0", "0"]
     assert warm == cold
+
+
+FALL = """
+from mpmopt.particles import lay_out
+from mpmopt.scene import Grid, Scene, Solid
+from mpmopt.problem import Problem
+import numpy as np
+scene = Scene(Grid((8, 8), 0.125), 1e-2, 10, gravity=(1.0, 0.0),
+              body=(Solid((0.25, 0.25), (0.5, 0.5)),))
+start = lay_out(scene).position[:, 0].mean()
+print(Problem(scene).value(np.empty(0)) - start)
+"""
+
+
+def test_kernels_that_were_edited_are_never_taken_from_the_cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
+    shutil.copytree(ROOT / "mpmopt", tmp_path / "mpmopt")
+    (before,) = start_up(tmp_path, FALL, tmp_path)
+    kernels = tmp_path / "mpmopt" / "mpm.py"
+    text = kernels.read_text()
+    gravity = "grid[node, 0] / m + world.dt * world.gravity_x\n"
+    assert text.count(gravity) == 1
+    kernels.write_text(text.replace(gravity, gravity.replace("world.dt *", "2.0 * world.dt *")))
+    (after,) = start_up(tmp_path, FALL, tmp_path)
+    assert float(before) > 0.0
+    assert float(after) == pytest.approx(2.0 * float(before), rel=1e-12)
 
 
 def test_the_example_in_the_readme_goes_farther(capsys):

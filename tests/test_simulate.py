@@ -4,9 +4,11 @@ import dataclasses
 
 import numpy as np
 import pytest
+from walker import walker
 
 from mpmopt.errors import DesignError, SimulationError
 from mpmopt.particles import lay_out
+from mpmopt.problem import Problem
 from mpmopt.simulate import Simulation
 
 
@@ -109,3 +111,17 @@ def test_a_body_without_particles_is_refused(scene):
         Simulation(
             scene, nothing, np.zeros(0), np.zeros(0), np.zeros(0), np.zeros((scene.steps, 2))
         )
+
+
+def test_blocks_visit_hardly_more_nodes_than_the_whole_body():
+    scene = walker(128, 2e-4)
+    problem = Problem(scene)
+    simulation = problem.simulation(problem.join(0.0, 1.0, -0.3, -0.5))
+    nodes, part = simulation.room
+    blocks = len(simulation.body.first) - 1
+    assert blocks == 8
+    # The body covers 40 x 20 cells; a quarter more on each axis is kept free.
+    assert nodes == (50 + 4) * (25 + 4)
+    assert blocks * part <= 2.1 * nodes
+    # Groups of four particles: no more than three are repeated to fill the last one.
+    assert 0 <= 4 * len(simulation.body.mass) - simulation.initial.shape[1] <= 3
