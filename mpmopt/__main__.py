@@ -51,6 +51,30 @@ def postprocess(path: Path, threshold: float) -> int:
     return 0
 
 
+def audit(path: Path) -> int:
+    """Print whether a run's best design, without void, keeps its gain in other discretisations."""
+    import numpy as np
+
+    from mpmopt import runfile
+    from mpmopt.audit import audit as audited
+
+    run = runfile.read(path)
+    print(
+        f"{'post-processed design':<21}  {'cells':>9}  {'step':>8}  full block  design  gain kept"
+    )
+    for row in audited(run.problem(), run.best):
+        cells = f"{row.cells[0]} x {row.cells[1]}"
+        if row.failure:
+            print(f"{row.name:<21}  no value: {row.failure}")
+            continue
+        kept = "" if np.isnan(row.kept) else f"{row.kept:9.0%}"
+        print(
+            f"{row.name:<21}  {cells:>9}  {row.time_step:8.2g}  {row.reference:10.4f}  "
+            f"{row.distance:6.4f}  {kept}"
+        )
+    return 0
+
+
 def main(argv: list[str] | None = None) -> int:
     """Run a command; 0 if all is well, 1 if not, 2 if it was not understood."""
     parser = argparse.ArgumentParser(prog="python -m mpmopt", description=__doc__)
@@ -64,6 +88,9 @@ def main(argv: list[str] | None = None) -> int:
         "--threshold", type=float, default=0.3, help="gamma from which a particle stays (0.3)"
     )
     command.set_defaults(do=lambda arguments: postprocess(arguments.path, arguments.threshold))
+    command = commands.add_parser("audit", help="simulate a run's best design more finely")
+    command.add_argument("path", type=Path, metavar="RUN.h5")
+    command.set_defaults(do=lambda arguments: audit(arguments.path))
     arguments = parser.parse_args(argv)
     try:
         return int(arguments.do(arguments))

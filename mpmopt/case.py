@@ -16,6 +16,7 @@ import numpy as np
 from tqdm import tqdm
 
 from mpmopt import runfile
+from mpmopt.audit import audit
 from mpmopt.binary import THRESHOLD, Drawing, farthest, full_block, pieces, post_processed
 from mpmopt.checkpoints import Checkpointing
 from mpmopt.errors import MpmoptError, SimulationError, StorageError
@@ -168,7 +169,7 @@ def summarise(result: Optimisation, drawing: Drawing) -> dict[str, Any]:
     Reference designs count with the better of the first and the best design's actuation.
     """
     best, problem = result.result, result.problem()
-    half = Problem(problem.scene.vary(time_step=best.time_step / 2.0), best.beta)
+    _, *others = audits = audit(problem, best.x)
     first = result.history[0]
     actuations = [Variables.of(item.x, item.gamma.size) for item in (first, best)]
     actuation = actuations[1]
@@ -185,7 +186,8 @@ def summarise(result: Optimisation, drawing: Drawing) -> dict[str, Any]:
         "loose_particles": int(
             (pieces(problem.scene, problem.gamma(best.x) >= THRESHOLD) > 0).sum()
         ),
-        "post_processed_half_step": _value_or_none(lambda: post_processed(half, best.x)),
+        "post_processed_half_step": _number_or_none(audits[1].distance),
+        "gain_kept": {row.name: _number_or_none(row.kept) for row in others},
         "greyness": best.greyness,
         "a": numbers(actuation.a),
         "theta": numbers(actuation.theta),
@@ -200,11 +202,14 @@ def summarise(result: Optimisation, drawing: Drawing) -> dict[str, Any]:
 def _value_or_none(function: Callable[[], float]) -> float | None:
     """A value for the summary, null in JSON if there is none."""
     try:
-        value = function()
+        return _number_or_none(function())
     except SimulationError as error:
         logging.getLogger(__name__).warning("no value: %s", error)
         return None
-    return value if np.isfinite(value) else None
+
+
+def _number_or_none(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
 
 
 def _draw(out: Path, result: Optimisation, summary: Mapping[str, Any]) -> None:
@@ -217,9 +222,15 @@ def _draw(out: Path, result: Optimisation, summary: Mapping[str, Any]) -> None:
 
 def table(summary: Mapping[str, Any]) -> str:
     """The summary as aligned text."""
-    width = max(len(name) for name in summary)
-    lines = []
+    flat: dict[str, Any] = {}
     for name, value in summary.items():
+        if isinstance(value, Mapping):
+            flat.update({f"{name}, {key}": item for key, item in value.items()})
+        else:
+            flat[name] = value
+    width = max(len(name) for name in flat)
+    lines = []
+    for name, value in flat.items():
         shown = f"{value:.4f}" if isinstance(value, float) else str(value)
         lines.append(f"{name.replace('_', ' '):<{width}}  {shown}")
     return "\n".join(lines)

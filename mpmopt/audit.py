@@ -1,0 +1,108 @@
+"""Does a design keep its gain in other discretisations? Numerical propulsion does not."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from mpmopt.binary import THRESHOLD, distance
+from mpmopt.errors import SceneError, SimulationError
+from mpmopt.particles import lay_out
+from mpmopt.problem import Problem
+from mpmopt.scene import Grid, Scene
+
+
+@dataclass(frozen=True)
+class Audited:
+    """One simulation of a post-processed design.
+
+    Attributes
+    ----------
+    name : str
+        What differs from the discretisation that it was designed in.
+    cells : tuple of int
+    time_step : float
+    reference : float
+        Objective L of the full block with the same actuation, or not a number.
+    distance : float
+        Objective L of the design, or not a number.
+    kept : float
+        Share of the gain over the reference that the design has where it was designed.
+    failure : str
+        Why there is no number, or empty.
+    """
+
+    name: str
+    cells: tuple[int, int]
+    time_step: float
+    reference: float = np.nan
+    distance: float = np.nan
+    kept: float = np.nan
+    failure: str = ""
+
+
+def refined(scene: Scene) -> Scene:
+    """The scene with cells half as wide, at the same Courant number."""
+    nx, ny = scene.grid.cells
+    return replace(
+        scene,
+        grid=Grid((2 * nx, 2 * ny), scene.grid.dx / 2.0),
+        time_step=scene.time_step / 2.0,
+        steps=2 * scene.steps,
+    )
+
+
+def audit(problem: Problem, x: NDArray[np.float64]) -> list[Audited]:
+    """Simulate a design without its void again with other steps and cells.
+
+    A robot is the same at every discretisation: particles that gamma >= 0.3 makes solid stay, those
+    of another lattice take this from the nearest one.
+
+    Parameters
+    ----------
+    problem : Problem
+        In the discretisation that the design is from.
+    x : (n,) array
+        Its variables.
+
+    Returns
+    -------
+    list of Audited
+        First as it was designed, then with half the step, twice the step, and cells half as wide.
+        What cannot be simulated says why.
+
+    Raises
+    ------
+    DesignError
+        If x does not fit.
+    """
+    variables = problem.split(x)
+    solid = problem.gamma(x) >= THRESHOLD
+    body = problem.particles.position[problem.particles.designed]
+    scene = problem.scene
+    variants: dict[str, Callable[[], Scene]] = {
+        "as designed": lambda: scene,
+        "half the step": lambda: scene.vary(time_step=scene.time_step / 2.0),
+        "twice the step": lambda: scene.vary(time_step=scene.time_step * 2.0),
+        "cells half as wide": lambda: refined(scene),
+    }
+    rows: list[Audited] = []
+    for name, make in variants.items():
+        try:
+            there = make()
+            particles = lay_out(there)
+            position = particles.position[particles.designed]
+            keep = solid[KDTree(body).query(position)[1]] if len(body) else solid
+            reference = distance(there, np.ones_like(keep), variables)
+            row = Audited(name, there.grid.cells, there.time_step, reference)
+            row = replace(row, distance=distance(there, keep, variables))
+            gain = rows[0].distance - rows[0].reference if rows else row.distance - reference
+            kept = (row.distance - reference) / gain if gain > 0.0 else np.nan
+            rows.append(replace(row, kept=kept))
+        except (SceneError, SimulationError) as error:
+            rows.append(Audited(name, scene.grid.cells, scene.time_step, failure=str(error)))
+    return rows

@@ -1,0 +1,66 @@
+"""Audits: the same robot in other discretisations."""
+
+import numpy as np
+import pytest
+from conftest import small_scene
+from crawler import crawler
+from walker import slanted_legs, walker
+
+from mpmopt.audit import audit, refined
+from mpmopt.binary import distance
+from mpmopt.particles import lay_out
+from mpmopt.problem import Problem
+from mpmopt.scene import Actuator
+
+
+def drawn(scene):
+    """The legs drawn by hand as a design of a problem."""
+    problem = Problem(scene, 32.0)
+    position = problem.particles.position[problem.particles.designed]
+    return problem, problem.join(np.where(slanted_legs(position), 1.0, -1.0), 1.0, -0.3, -0.5)
+
+
+def test_an_audit_simulates_the_same_robot_with_other_steps_and_cells():
+    problem, x = drawn(walker(64, 4e-4))
+    scene = problem.scene
+    rows = {row.name: row for row in audit(problem, x)}
+    assert list(rows) == ["as designed", "half the step", "twice the step", "cells half as wide"]
+    assert [row.time_step for row in rows.values()] == [4e-4, 2e-4, 8e-4, 2e-4]
+    assert rows["cells half as wide"].cells == (128, 128)
+    assert rows["as designed"].kept == 1.0
+    keep = problem.gamma(x) >= 0.3
+    half = scene.vary(time_step=2e-4)
+    assert rows["half the step"].distance == distance(half, keep, problem.split(x))
+    gains = {name: row.distance - row.reference for name, row in rows.items()}
+    for name, row in rows.items():
+        assert row.kept == pytest.approx(gains[name] / gains["as designed"])
+        assert 0.3 < row.kept < 1.6
+
+
+def test_the_finer_robot_has_the_same_shape():
+    for scene in (walker(64, 8e-4), crawler(64, 8e-4), small_scene()):
+        fine = refined(scene)
+        assert fine.courant == pytest.approx(scene.courant)
+        assert fine.duration == pytest.approx(scene.duration)
+        areas = [lay_out(each).volume.sum() for each in (scene, fine)]
+        assert areas[0] == pytest.approx(areas[1])
+
+
+def test_what_cannot_be_simulated_says_why():
+    scene = small_scene()
+    scene = scene.vary(
+        time_step=scene.duration / np.ceil(scene.duration / (0.9 * scene.largest_time_step))
+    )
+    problem = Problem(scene)
+    rows = {row.name: row for row in audit(problem, problem.join(0.5, 0.1, 0.2, 0.1))}
+    assert "time_step" in rows["twice the step"].failure
+    assert np.isnan(rows["twice the step"].kept)
+    assert not rows["half the step"].failure
+
+
+def test_a_body_without_design_is_audited_too():
+    c = 1 / 16
+    problem = Problem(small_scene(body=(Actuator((3 * c, 5 * c), (6 * c, 7 * c)),)))
+    rows = audit(problem, problem.join(np.empty(0), 0.2, 0.1, 0.1))
+    assert rows[1].distance == rows[1].reference
+    assert np.isnan(rows[1].kept)
