@@ -33,7 +33,7 @@ from mpmopt.simulate import Simulation
 
 PEERS = {"warp_mpm": "warp-lang", "taichi_mpm": "taichi", "jax_mpm": "jax"}
 VALUE_TOLERANCE, GRADIENT_TOLERANCE = 1e-10, 1e-9  # relative
-KEEP_ALL = Checkpointing("all", memory=2**33)
+KEEP_ALL = Checkpointing(memory=2**34)
 
 Run = Callable[[], object]
 

@@ -1,4 +1,4 @@
-"""Which particle states are kept for the reverse loop, and the HDF5 store that keeps them."""
+"""Which particle states are kept for the reverse loop, and the store, in memory or HDF5."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Literal
-from uuid import uuid4
+from typing import Any, Literal
 
 import h5py
 import numpy as np
@@ -132,10 +131,11 @@ class Schedule:
 
 
 class Checkpoints:
-    """HDF5 file with room for arrays of every segment, removed at the end unless it is to be kept.
+    """Room for arrays of every segment: in memory, or in an HDF5 file.
 
-    All its room is taken before the first step: a disk that is full, or that fills up meanwhile,
-    costs no computed step, and HDF5, which does not survive it, never meets a write that fails.
+    The file is removed at the end unless it is to be kept. All its room is taken before the first
+    step: a disk that is full, or that fills up meanwhile, costs no computed step, and HDF5, which
+    does not survive it, never meets a write that fails.
 
     Parameters
     ----------
@@ -160,13 +160,19 @@ class Checkpoints:
         self.schedule = schedule
         self._target = store if isinstance(store, Path) else None
         self.path: Path | None = None
+        self._file: h5py.File | None = None
+        self._store: dict[str, Any]  # arrays or datasets
         if schedule.in_memory:
-            name = f"checkpoints-{uuid4()}"  # HDF5 knows files by their names
-            self._file = h5py.File(
-                name, "w", driver="core", backing_store=False, block_size=MEGABYTE
-            )
-            self._lay_out(arrays)
-            self._datasets = dict(self._file)
+            try:
+                self._store = {
+                    name: np.empty((len(schedule.segments), *shape), dtype)
+                    for name, (shape, dtype) in arrays.items()
+                }
+            except MemoryError as error:
+                raise StorageError(
+                    f"no memory for checkpoints of {schedule.stored_bytes / MEGABYTE:.3g} MB: "
+                    f"{error}; store fewer states (Checkpointing.every), or put them on disk"
+                ) from error
             return
         if self._target is not None and self._target.exists() and not _is_store(self._target):
             raise StorageError(
@@ -182,11 +188,11 @@ class Checkpoints:
             )
             size = len(schedule.segments) * sum(sizes) + MEGABYTE
             self._take_room(size)  # twice, because HDF5 begins with an empty file
-            with h5py.File(self.path, "w") as self._file:
-                self._lay_out(arrays)
+            with h5py.File(self.path, "w") as file:
+                self._lay_out(file, arrays)
             self._take_room(self.path.stat().st_size)
             self._file = h5py.File(self.path, "r+")
-            self._datasets = dict(self._file)
+            self._store = dict(self._file)
         except OSError as error:
             self._remove()
             raise StorageError(
@@ -195,8 +201,10 @@ class Checkpoints:
                 "them elsewhere (Checkpointing.store, or the environment variable TMPDIR)"
             ) from error
 
-    def _lay_out(self, arrays: Mapping[str, tuple[tuple[int, ...], DTypeLike]]) -> None:
-        self._file.attrs["format"] = FORMAT
+    def _lay_out(
+        self, file: h5py.File, arrays: Mapping[str, tuple[tuple[int, ...], DTypeLike]]
+    ) -> None:
+        file.attrs["format"] = FORMAT
         segments = len(self.schedule.segments)
         settings = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
         settings.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
@@ -204,7 +212,7 @@ class Checkpoints:
         for name, (shape, dtype) in arrays.items():
             space = h5py.h5s.create_simple((segments, *shape))
             kind = h5py.h5t.py_create(np.dtype(dtype))
-            h5py.h5d.create(self._file.id, name.encode(), kind, space, dcpl=settings)
+            h5py.h5d.create(file.id, name.encode(), kind, space, dcpl=settings)
 
     def _take_room(self, size: int) -> None:
         assert self.path is not None
@@ -219,7 +227,7 @@ class Checkpoints:
         """Store named arrays of a segment; they may be shorter than the room for them."""
         for name, array in arrays.items():
             where = (segment, *map(slice, array.shape))
-            self._datasets[name][where] = array
+            self._store[name][where] = array
 
     def read(self, segment: int, name: str) -> NDArray:
         """An array of a segment, with all the room that it has.
@@ -230,7 +238,7 @@ class Checkpoints:
             If the file lost it.
         """
         try:
-            return np.asarray(self._datasets[name][segment])
+            return np.asarray(self._store[name][segment])
         except (OSError, KeyError, RuntimeError) as error:
             raise StorageError(
                 f"cannot read {name} of segment {segment} back from {self.path or 'memory'}: "
@@ -245,7 +253,8 @@ class Checkpoints:
         StorageError
             If it cannot be moved there.
         """
-        self._file.close()
+        if self._file is not None:
+            self._file.close()
         if self.path is not None and self._target is not None:
             try:
                 os.replace(self.path, self._target)

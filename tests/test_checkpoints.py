@@ -156,6 +156,12 @@ def test_too_little_room_on_the_disk_is_said_before_any_step(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_too_little_memory_is_a_storage_error():
+    schedule = Schedule(steps=10, segment=1, all_stored=False, in_memory=True, step_bytes=2**50)
+    with pytest.raises(StorageError, match="no memory for checkpoints"):
+        Checkpoints(schedule, {"state": ((2**47,), float)})
+
+
 def test_a_folder_that_is_not_there_is_a_storage_error(tmp_path):
     schedule = Schedule(10, 1, False, False, 100)
     with pytest.raises(StorageError, match="no room for checkpoints"):
