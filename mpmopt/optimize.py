@@ -41,13 +41,16 @@ class Stage:
     time_step : float
     solid : bool
         Whether the best design is the one that goes farthest once its void is removed
-        (`binary.post_processed`), which costs a forward run more, instead of as it is.
+        (`binary.post_processed`), which costs a forward run more, instead of as it is. The climb
+        itself goes on from the one that goes farthest as it is.
     coarsening : int
         How many of the scene's cells go into the width of this stage's: early stages need no more.
     move_limit : float
         Greatest step of a variable, as a fraction of its range.
     leave_out : float
         Design particles whose gamma is below this are not simulated (`Problem`).
+    most_iterations : int, optional
+        Successful evaluations of this stage, instead of `Settings.most_iterations`.
 
     Raises
     ------
@@ -63,6 +66,7 @@ class Stage:
     coarsening: int = 1
     move_limit: float = 0.05
     leave_out: float = 0.0
+    most_iterations: int | None = None
 
     def __post_init__(self) -> None:
         for name in ("beta", "mass_floor", "stiffness_floor", "time_step", "move_limit"):
@@ -74,6 +78,9 @@ class Stage:
         if not 0.0 <= leave_out < 1.0:
             raise DesignError(f"Stage: leave_out = {leave_out} must be at least 0 and below 1")
         object.__setattr__(self, "leave_out", leave_out)
+        if self.most_iterations is not None:
+            most = count("Stage", "most_iterations", self.most_iterations, 1, error=DesignError)
+            object.__setattr__(self, "most_iterations", most)
         coarsening = count("Stage", "coarsening", self.coarsening, 1, error=DesignError)
         object.__setattr__(self, "coarsening", coarsening)
 
@@ -110,7 +117,7 @@ class Settings:
     sharpen_asymptotes : bool
         Initial asymptotes at 0.5 / (beta + 1) of the range instead of 0.5.
     best_first : bool
-        Start each stage from the best design of the one before, instead of its last design.
+        Start each stage from the design of the one before that went farthest, instead of its last.
     window : int
         Iterations in the moving average of the stop rule.
     tolerance : float
@@ -279,7 +286,7 @@ def optimise(
 ) -> Optimisation:
     """Maximise the distance travelled, stage by stage.
 
-    An evaluation that fails steps back to the stage's best design and halves the move limit,
+    An evaluation that fails steps back to the stage's farthest design and halves the move limit,
     which then recovers slowly. A stage of which no design ran yet halves its time step instead.
 
     Parameters
@@ -389,7 +396,7 @@ class _StageRun:
         self.stage = self.run.settings.stages[index]
         self.problem = self.stage.problem(self.run.scene, None, whole.checkpointing)
         self.best_merit: tuple[float, ...] | None = None
-        self.best_gradient: NDArray[np.float64] | None = None
+        self.farthest: tuple[Iteration, NDArray[np.float64]] | None = None  # and its gradient
 
     def climb(self, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], str, bool]:
         """Climb from x to where the stop rule ends the stage.
@@ -409,24 +416,25 @@ class _StageRun:
             evaluated = self._evaluate(x, mma.move_limit)
             if evaluated is None:
                 failures += 1
-                none_ran = self.best_gradient is None
+                none_ran = self.farthest is None
                 if failures >= settings.most_failures or (none_ran and failures > HALVINGS):
                     why = f"it gave up after {failures} failed evaluations in a row."
                     return x, why, True
-                best = self.run.best.get(self.index)
-                if best is None or self.best_gradient is None:
+                if self.farthest is None:
                     self._halve_time_step()
                     continue
                 mma.reset()
                 mma.move_limit /= 2.0
-                x = mma.step(best.x, -best.objective, -self.best_gradient)
+                item, gradient = self.farthest
+                x = mma.step(item.x, -item.objective, -gradient)
                 continue
             failures = 0
             value, gradient = evaluated
             values.append(value)
             stop = self._stop_reason(values)
             if stop:
-                return (self.run.best[self.index].x if settings.best_first else x), stop, False
+                onward = self.farthest[0].x if self.farthest and settings.best_first else x
+                return onward, stop, False
             went_back = len(values) > 1 and value < values[-2]
             factor = SHORTEN if went_back and settings.adapt_move_limit else LENGTHEN
             mma.move_limit = min(self.stage.move_limit, factor * mma.move_limit)
@@ -467,9 +475,11 @@ class _StageRun:
         )
         run.history.append(iteration)
         merit = (np.nan_to_num(solid, nan=-np.inf), value) if self.stage.solid else (value,)
+        if not failure and (self.farthest is None or value > self.farthest[0].objective):
+            self.farthest = iteration, gradient
         if not failure and (self.best_merit is None or merit > self.best_merit):
             run.best[self.index] = iteration
-            self.best_merit, self.best_gradient = merit, gradient
+            self.best_merit = merit
         self.whole.report()
         return None if failure else (value, gradient)
 
@@ -500,6 +510,6 @@ class _StageRun:
                     f"{settings.tolerance:.1e} after {count} of them (last step {last.step:.1e} of "
                     f"the range, projected gradient {last.projected_gradient:.1e})."
                 )
-        if count >= settings.most_iterations:
+        if count >= (self.stage.most_iterations or settings.most_iterations):
             return f"it reached its limit of {count} iterations."
         return ""

@@ -78,7 +78,7 @@ def test_each_stage_starts_from_the_last_ones_best(scene, start):
     assert np.array_equal(second.x, last_of_first.x)
 
 
-def test_a_coarse_stage_hands_its_best_design_to_the_finer_grid():
+def test_a_coarse_stage_hands_its_farthest_design_to_the_finer_grid():
     scene = walker(128, 4e-4)
     scene = dataclasses.replace(scene, steps=100)
     stages = (
@@ -90,8 +90,10 @@ def test_a_coarse_stage_hands_its_best_design_to_the_finer_grid():
     run = optimise(scene, settings, coarse.join(0.0, 1.0, -0.3, -0.5))
     first, second = (next(item for item in run.history if item.stage == stage) for stage in (0, 1))
     assert 4 * (first.x.size - 3) == second.x.size - 3
-    handed = Problem(scene).transfer(coarse, run.best[0].x)
-    assert np.array_equal(second.x, handed)
+    # The farthest as it is goes on, though the best is the farthest without void.
+    farthest = max((i for i in run.history if i.stage == 0), key=lambda item: item.objective)
+    assert farthest is not run.best[0]
+    assert np.array_equal(second.x, Problem(scene).transfer(coarse, farthest.x))
     assert second.step == 0.0
     assert run.result.stage == 1  # whatever the coarse grid says
 
@@ -208,6 +210,15 @@ def test_a_start_that_does_not_fit_is_refused(scene):
         optimise(scene, QUICK, np.zeros(3))
 
 
+def test_a_stage_may_have_its_own_limit_of_iterations(scene, start):
+    stages = (dataclasses.replace(STAGES[0], most_iterations=7), STAGES[1])
+    settings = dataclasses.replace(
+        QUICK, stages=stages, least_iterations=5, most_iterations=5, tolerance=0.0
+    )
+    run = optimise(scene, settings, start)
+    assert [sum(item.stage == stage for item in run.history) for stage in (0, 1)] == [7, 5]
+
+
 def test_a_stage_that_never_runs_gives_up_after_three_halvings(scene, start, monkeypatch):
     calls = fail_on(monkeypatch, set(range(1000)))
     run = optimise(scene, QUICK, start)
@@ -230,6 +241,7 @@ def test_a_stage_that_never_runs_gives_up_after_three_halvings(scene, start, mon
         {"coarsening": 1.5},
         {"leave_out": -0.1},
         {"leave_out": 1.0},
+        {"most_iterations": 0},
     ],
 )
 def test_senseless_stages_are_refused(wrong):
