@@ -11,14 +11,17 @@ from mpmopt.mpm import interpolation
 from mpmopt.particles import Particles, lay_out, mirror_images
 from mpmopt.scene import Material, Scene
 
+# Weights below this are left out of a filter of many passes.
+NEGLIGIBLE = 1e-8
+
 
 def filter_matrix(scene: Scene, particles: Particles) -> scipy.sparse.csr_array[np.float64]:
     """The paper's filter (sec. 2.3, steps 1 to 3) as one matrix (D, D) over the D design particles.
 
-    Particle to grid, 3 x 3 convolution, grid to particle. Only design particles take part; nodes
-    that carry none are left out and the weights that remain are scaled to sum to one, so that a
-    constant field stays constant. A mirror shows the filter the other half's particles, so that the
-    paper's mapping of one half to the other is what it does by itself.
+    Particle to grid, 3 x 3 convolution (`Scene.filter_passes` times), grid to particle. Only design
+    particles take part; nodes that carry none are left out and the weights that remain are scaled
+    to sum to one, so that a constant field stays constant. A mirror shows the filter the other
+    half's particles: by itself it does what the paper's mapping of one half to the other does.
     """
     rows = scene.grid.cells[1] + 1
     body = lay_out(scene, whole=True)
@@ -51,8 +54,12 @@ def filter_matrix(scene: Scene, particles: Particles) -> scipy.sparse.csr_array[
     def normalised(matrix: scipy.sparse.csr_array) -> scipy.sparse.csr_array:
         return scipy.sparse.diags_array(1.0 / matrix.sum(axis=1)) @ matrix
 
-    to_grid = normalised(to_particles.T.tocsr())
-    matrix = to_particles @ (normalised(convolution) @ to_grid)
+    matrix, convolution = normalised(to_particles.T.tocsr()), normalised(convolution)
+    for _ in range(scene.filter_passes):
+        matrix = (convolution @ matrix).tocsr()
+        matrix.data[matrix.data < NEGLIGIBLE] = 0.0
+        matrix.eliminate_zeros()
+    matrix = normalised((to_particles @ matrix).tocsr())
     if scene.mirror is None:
         return matrix.tocsr()
     # Rows of the simulated half; columns summed over a particle and its image.

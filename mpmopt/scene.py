@@ -272,6 +272,10 @@ class Scene(_Checked):
         Particles per cell and direction.
     filter_weights : (float, float, float), optional
         Weights w0, w1, w2 of the design filter's 3 x 3 convolution: w0 + 4 w1 + 4 w2 = 1.
+    filter_length : float, optional
+        Standard deviation, along each axis, that the filter reaches by as many passes of its
+        convolution (`filter_passes`), so that designs do not depend on the grid. Zero is one pass,
+        as in the paper.
     mirror : Mirror, optional
         Plane about which all of the scene is symmetric. Body and walls are given whole.
 
@@ -291,6 +295,7 @@ class Scene(_Checked):
     direction: Vector = (1.0, 0.0)
     particles_per_cell: int = 2
     filter_weights: tuple[float, float, float] = (0.64, 0.08, 0.01)
+    filter_length: float = 0.0
     mirror: Mirror | None = None
 
     def __post_init__(self) -> None:
@@ -310,6 +315,7 @@ class Scene(_Checked):
             gravity=_vector("Scene", "gravity", self.gravity),
             direction=_vector("Scene", "direction", self.direction),
             particles_per_cell=count("Scene", "particles_per_cell", self.particles_per_cell, 1),
+            filter_length=number("Scene", "filter_length", self.filter_length),
             filter_weights=_tuple(
                 "Scene",
                 "filter_weights",
@@ -328,6 +334,11 @@ class Scene(_Checked):
             raise SceneError(
                 f"Scene: filter_weights sum to w0 + 4 w1 + 4 w2 = {w0 + 4 * w1 + 4 * w2:.15g}, "
                 "must sum to 1"
+            )
+        if not 0.0 <= self.filter_length <= max(self.grid.size):
+            raise SceneError(
+                f"Scene: filter_length = {self.filter_length:g} must be from 0 to the grid's size "
+                f"{max(self.grid.size):g}"
             )
         self._check_body()
         self._check_walls()
@@ -496,6 +507,17 @@ class Scene(_Checked):
     def duration(self) -> float:
         """Simulated time."""
         return self.steps * self.time_step
+
+    @property
+    def filter_passes(self) -> int:
+        """How often the filter's convolution is applied, at least once.
+
+        The two transfers between particles and grid spread by a variance of dx^2 / 4 each, and one
+        pass adds that of its weights.
+        """
+        _, w1, w2 = self.filter_weights
+        cells = self.filter_length / self.grid.dx
+        return max(1, round((cells**2 - 0.5) / (2.0 * (w1 + 2.0 * w2))))
 
     def vary(
         self,

@@ -83,6 +83,37 @@ def test_filter_does_not_wrap_round_the_edge_of_the_grid(rng):
     assert matrix @ phi == pytest.approx(literal_filter(scene, phi), abs=1e-14)
 
 
+@pytest.mark.parametrize("length", [1 / 64, 1 / 80])
+def test_a_filter_length_is_the_same_on_every_grid(length):
+    fields = []
+    for n in (64, 128):
+        c = 1 / 64
+        scene = Scene(
+            Grid((n, n), 1 / n), 1e-4, 1, filter_length=length,
+            body=(
+                Design((24 * c, 24 * c), (40 * c, 40 * c)),
+                Solid((24 * c, 40 * c), (40 * c, 42 * c)),
+            ),
+        )  # fmt: skip
+        particles = lay_out(scene)
+        x, y = particles.position[particles.designed].T - 0.5
+        matrix = filter_matrix(scene, particles)
+        assert matrix.sum(axis=1) == pytest.approx(1.0, abs=1e-13)
+        # Of a particle in the middle, far from the edges.
+        middle = np.argmin(x**2 + y**2)
+        weights = matrix[[middle]].toarray()[0]
+        variance = weights @ (x - x[middle]) ** 2, weights @ (y - y[middle]) ** 2
+        # The nearest number of passes: within half a pass, 0.1 cells^2, of what was asked for.
+        assert variance == pytest.approx([length**2] * 2, abs=0.12 / n**2)
+        step = matrix @ np.where(x > 0.0, 1.0, -1.0)
+        fields.append(np.interp(np.linspace(-0.1, 0.1, 9), x[y == y[middle]], step[y == y[middle]]))
+    assert fields[0] == pytest.approx(fields[1], abs=0.02)
+
+
+def test_a_filter_length_below_one_pass_is_one_pass(scene):
+    assert scene.filter_passes == dataclasses.replace(scene, filter_length=1e-3).filter_passes == 1
+
+
 @pytest.mark.parametrize("beta", [0.5, 1.0, 16.0])
 def test_projection_hits_its_ends_and_is_odd_about_a_half(beta):
     assert project(np.array([-1.0, 0.0, 1.0]), beta) == pytest.approx([0.0, 0.5, 1.0], abs=1e-15)
