@@ -47,7 +47,7 @@ def slanted_legs(positions: np.ndarray) -> np.ndarray:
 
 
 CASES = {
-    "default": Case(crawler(128, 5e-4), refined(8e-4, 5e-4, coarse_stages=5), slanted_legs),
+    "default": Case(crawler(128, 5e-4), refined(8e-4, 5e-4), slanted_legs),
     "preview": Case(crawler(64, 8e-4), sharpened(8e-4), slanted_legs),
     "paper": Case(crawler(128, 2e-4), published(2e-4), slanted_legs),
 }

@@ -41,7 +41,7 @@ def slanted_legs(positions: np.ndarray) -> np.ndarray:
 
 
 CASES = {
-    "default": Case(walker(128, 5e-4), refined(8e-4, 5e-4, coarse_stages=7), slanted_legs),
+    "default": Case(walker(128, 5e-4), refined(8e-4, 5e-4), slanted_legs),
     "preview": Case(walker(64, 8e-4), sharpened(8e-4), slanted_legs),
     "paper": Case(walker(128, 2e-4), published(2e-4), slanted_legs),
 }

@@ -69,21 +69,21 @@ def sharpened(time_step: float) -> Settings:
     return Settings(_sharpening(time_step, stages=7), most_iterations=25)
 
 
-def refined(coarse_time_step: float, time_step: float, coarse_stages: int) -> Settings:
-    """Cells twice as wide find the gait, then the scene's own finish the shape.
+def refined(coarse_time_step: float, time_step: float) -> Settings:
+    """Cells twice as wide find the gait, then the scene's own find the shape.
 
-    The coarse stages are the first of `sharpened`; four starts, whose signals are a quarter turn
-    apart, scout three of them. The fine ones go on to beta = 32, beginning at 16 at the latest,
-    with a mass floor of 1e-2 and short moves, which do not lose the gait; they are judged without
-    void.
+    The coarse stages are the first five of `sharpened`; four starts, whose signals are a quarter
+    turn apart, scout three of them. The fine ones begin at beta = 8 and stay at 16 and 32 for several
+    stages: each begins with long moves again, which shake the design out of what it got stuck in.
+    Their void has a mass floor of 1e-2, and what is clear void is left out.
     """
-    coarse = _sharpening(coarse_time_step, coarse_stages, coarsening=2)
+    coarse = _sharpening(coarse_time_step, stages=5, coarsening=2)
     fine = tuple(
-        Stage(beta, 1e-2, 1e-3, time_step, solid=True, move_limit=0.02)
-        for beta in (8.0, 16.0, 32.0)
-        if beta >= min(coarse[-1].beta, 16.0)
+        Stage(beta, 1e-2, 1e-3, time_step, solid=True, move_limit=move_limit, leave_out=0.05)
+        for beta, move_limit, repeats in ((8.0, 0.05, 1), (16.0, 0.05, 4), (32.0, 0.025, 3))
+        for _ in range(repeats)
     )
-    return Settings((*coarse, *fine), most_iterations=25, scouting=3)
+    return Settings((*coarse, *fine), most_iterations=25, tolerance=0.0, scouting=3)
 
 
 def published(time_step: float) -> Settings:

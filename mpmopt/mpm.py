@@ -119,9 +119,7 @@ class Tile(NamedTuple):
     base: NDArray[np.float64]  # (2 T, 4) first of the three nodes along x and y
     spline: NDArray  # (24 T, 4) by threes: w and w r along x and y; r and s of x, of y
     affine: NDArray  # (4 T, 4) A, the affine momentum
-    gathered: (
-        NDArray  # (8 T, 4) A_bar; sums over nodes of w q_bar and grad(w) times what it weights
-    )
+    gathered: NDArray  # (8 T, 4) by `p2g_adjoint`: A_bar, sum of w q_bar, sum over grad(w)
     mass_bar: NDArray  # (T, 4) sum over nodes of w m_bar
 
 
@@ -820,7 +818,7 @@ def advance_adjoint(states, grids, windows, logs, first, last, body, world, sign
                     body_bar, signal_bar, thread, threads):  # fmt: skip
     """Go back from the start of step `last` to the start of step `first`: the adjoint of `advance`.
 
-    `bar` (12, N) holds the adjoint of the state and is overwritten; `body_bar` and `signal_bar`
+    `bar` holds the adjoint of the state and is overwritten; `body_bar` and `signal_bar`
     (B, steps, K), by blocks, are added to. All that `advance` leaves of the steps must have been
     kept.
     """
