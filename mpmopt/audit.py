@@ -92,6 +92,7 @@ def audit(problem: Problem, x: NDArray[np.float64]) -> list[Audited]:
     }
     rows: list[Audited] = []
     for name, make in variants.items():
+        there = scene
         try:
             there = make()
             particles = lay_out(there)
@@ -104,5 +105,5 @@ def audit(problem: Problem, x: NDArray[np.float64]) -> list[Audited]:
             kept = (row.distance - reference) / gain if gain > 0.0 else np.nan
             rows.append(replace(row, kept=kept))
         except (SceneError, SimulationError) as error:
-            rows.append(Audited(name, scene.grid.cells, scene.time_step, failure=str(error)))
+            rows.append(Audited(name, there.grid.cells, there.time_step, failure=str(error)))
     return rows

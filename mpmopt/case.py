@@ -73,9 +73,9 @@ def refined(coarse_time_step: float, time_step: float) -> Settings:
     """Cells twice as wide find the gait, then the scene's own find the shape.
 
     The coarse stages are the first five of `sharpened`; four starts, whose signals are a quarter
-    turn apart, scout three of them. The fine ones begin at beta = 8 and stay at 16 and 32 for several
-    stages: each begins with long moves again, which shake the design out of what it got stuck in.
-    Their void has a mass floor of 1e-2, and what is clear void is left out.
+    turn apart, scout three of them. The fine ones begin at beta = 8 and stay at 16 and 32 for
+    several stages: each begins with long moves again, which shake the design out of what it got
+    stuck in. Their void has a mass floor of 1e-2, and what is clear void is left out.
     """
     coarse = _sharpening(coarse_time_step, stages=5, coarsening=2)
     fine = tuple(

@@ -52,7 +52,7 @@ NODE_SIZE = 4  # one record: momentum and mass (q_x, q_y, m, 0)
 TILE = 16
 
 # How `advance` ended.
-DONE, WINDOW_TOO_SMALL, ESCAPED, INVERTED = 0, 1, 2, 3
+DONE, WINDOW_TOO_SMALL, PART_TOO_SMALL, ESCAPED, INVERTED, ABANDONED = range(6)
 
 # No "nnan" or "ninf": comparisons must see what is not a number.
 OPTIONS: dict[str, Any] = {
@@ -144,15 +144,14 @@ class Scratch(NamedTuple):
     node_bar: NDArray  # (M, 4) adjoints of momentum and mass
     parts: NDArray  # (B, P, 4) what each block puts on the nodes of its own window
     ends: NDArray[np.int64]  # (B, 2) how the step ended for each block, and a particle
-    meeting: NDArray[np.int64]  # (16,) where threads meet
 
     @classmethod
     def make(cls, nodes: int, blocks: int, part: int, dtype: DTypeLike = float) -> "Scratch":
         """Room for so many nodes, blocks, and nodes of a block."""
         node, parts = (nodes, NODE_SIZE), (blocks, part, NODE_SIZE)
         velocity, velocity_bar, node_bar = (np.zeros(node, dtype) for _ in range(3))
-        ends, meeting = np.zeros((blocks, 2), np.int64), np.zeros(16, np.int64)
-        return cls(velocity, velocity_bar, node_bar, np.zeros(parts, dtype), ends, meeting)
+        ends = np.zeros((blocks, 2), np.int64)
+        return cls(velocity, velocity_bar, node_bar, np.zeros(parts, dtype), ends)
 
 
 @jit
@@ -194,18 +193,19 @@ def find_window(state, world, first, last):
     dx = world.dx
     lo = spread(0.5 * dx)
     hi_x, hi_y = spread((world.nodes_x - 1.5) * dx), spread((world.nodes_y - 1.5) * dx)
-    x_min, x_max, y_min, y_max = hi_x, lo, hi_y, lo
+    i_min, j_min = spread(float(world.nodes_x)), spread(float(world.nodes_y))
+    i_max = j_max = spread(0.0)
     for g in range(first, last):
         x, y = real(load(state, 12 * g)), real(load(state, 12 * g + 1))
         if not (within(x, lo, hi_x) and within(y, lo, hi_y)):
             return 0, 0, 0, 0, False
-        x_min, x_max = least(x_min, x), greatest(x_max, x)
-        y_min, y_max = least(y_min, y), greatest(y_max, y)
-    x0, x1, y0, y1 = x_min[0], x_max[0], y_min[0], y_max[0]
+        i, j = whole(x / dx - 0.5), whole(y / dx - 0.5)  # as in `locate`
+        i_min, i_max = least(i_min, i), greatest(i_max, i)
+        j_min, j_max = least(j_min, j), greatest(j_max, j)
+    i0, i1, j0, j1 = i_min[0], i_max[0], j_min[0], j_max[0]
     for k in range(1, 4):
-        x0, x1, y0, y1 = min(x0, x_min[k]), max(x1, x_max[k]), min(y0, y_min[k]), max(y1, y_max[k])
-    i0, j0 = int(x0 / dx - 0.5), int(y0 / dx - 0.5)
-    return i0, j0, int(x1 / dx - 0.5) + 3 - i0, int(y1 / dx - 0.5) + 3 - j0, True
+        i0, i1, j0, j1 = min(i0, i_min[k]), max(i1, i_max[k]), min(j0, j_min[k]), max(j1, j_max[k])
+    return int(i0), int(j0), int(i1 - i0) + 3, int(j1 - j0) + 3, True
 
 
 @jit
@@ -530,9 +530,9 @@ def mirror(records, window, world):
             image = line * step + (plane - k) * stride
             for lane in range(3):
                 sign = -1.0 if lane == normal else 1.0
-                total = records[image, lane] + sign * records[node, lane]
-                records[image, lane] = total
-                records[node, lane] = sign * total
+                folded = records[image, lane] + sign * records[node, lane]
+                records[image, lane] = folded
+                records[node, lane] = sign * folded
 
 
 @jit
@@ -736,20 +736,21 @@ def g2p_adjoint_row(part, k, velocity, n, v_bar, c1, w_x, w, r, w_s):
 
 
 @loop_jit
-def advance(states, grids, windows, logs, first, last, body, world, signal, scratch, thread,
-            threads):  # fmt: skip
+def advance(states, grids, windows, logs, first, last, body, world, signal, scratch, meeting,
+            thread, threads):  # fmt: skip
     """Advance from the start of step `first` to the start of step `last`.
 
     Step n leads from slot n to slot n + 1 of `states` and leaves its nodes in slot n of `grids`,
     its windows (those of the blocks, then the whole one) in slot n of `windows` and its ln J' in
     slot n of `logs`; slots are counted round, so that two states and one of the others suffice
     where nothing is kept. Returns the step reached, how it ended, and the particle concerned (or
-    -1); when a window does not fit into the records, more records and another call from the step
-    reached go on.
+    -1); when a window, the whole one or a block's, does not fit into the records, more records and
+    another call from the step reached go on.
 
-    Called by `threads` threads at once, each with its number. Each takes its blocks of particles
-    and its columns of nodes; what blocks put on nodes is added in their order, so that results do
-    not depend on the number of threads.
+    Called by `threads` threads at once, each with its number, which wait for each other at the
+    `meeting` (`mpmopt.threads`) and return when one of them gives up there. Each takes its blocks
+    of particles and its columns of nodes; what blocks put on nodes is added in their order, so that
+    results do not depend on the number of threads.
     """
     blocks = body.first.size - 1
     own = range(thread * blocks // threads, (thread + 1) * blocks // threads)
@@ -770,7 +771,7 @@ def advance(states, grids, windows, logs, first, last, body, world, signal, scra
                 windows[slot, k, 0], windows[slot, k, 1] = i0, j0
                 windows[slot, k, 2], windows[slot, k, 3] = ni, nj
                 if ni * nj > parts.shape[1]:
-                    ends[k, 0] = WINDOW_TOO_SMALL
+                    ends[k, 0] = PART_TOO_SMALL
                 else:
                     parts[k, : ni * nj] = 0.0
                     for g0 in range(p0, p1, TILE):
@@ -781,7 +782,8 @@ def advance(states, grids, windows, logs, first, last, body, world, signal, scra
                         locate(old, world, tile, g0, g1)
                         stress(old, new, log_J, body, world, signal[n], tile, g0, g1)
                         p2g(old, body, world, tile, (i0, j0, ni, nj), parts[k], g0, g1)
-        meet(scratch.meeting, threads)
+        if not meet(meeting, threads):
+            return n, ABANDONED, -1
         for k in range(blocks):
             if ends[k, 0] != DONE:
                 return n, ends[k, 0], ends[k, 1]
@@ -789,22 +791,25 @@ def advance(states, grids, windows, logs, first, last, body, world, signal, scra
             break
         i0, j0, ni, nj = whole_window(windows[slot, :blocks], world)
         window = (i0, j0, ni, nj)
-        if ni * nj > grid.shape[0]:
-            return n, WINDOW_TOO_SMALL, -1
         if thread == 0:
             for k in range(4):
                 windows[slot, blocks, k] = window[k]
+        if ni * nj > grid.shape[0]:
+            return n, WINDOW_TOO_SMALL, -1
         columns = range(thread * ni // threads, (thread + 1) * ni // threads)
         for a in columns:
             add_blocks(parts, windows[slot], window, a, grid)
         if world.mirror_axis >= 0:
-            meet(scratch.meeting, threads)
+            if not meet(meeting, threads):
+                return n, ABANDONED, -1
             if thread == 0:
                 mirror(grid, window, world)
-            meet(scratch.meeting, threads)
+            if not meet(meeting, threads):
+                return n, ABANDONED, -1
         for a in columns:
             grid_update(grid, window, world, scratch, a)
-        meet(scratch.meeting, threads)
+        if not meet(meeting, threads):
+            return n, ABANDONED, -1
         for k in own:
             for g0 in range(body.first[k], body.first[k + 1], TILE):
                 g1 = min(g0 + TILE, body.first[k + 1])
@@ -815,7 +820,7 @@ def advance(states, grids, windows, logs, first, last, body, world, signal, scra
 
 @loop_jit
 def advance_adjoint(states, grids, windows, logs, first, last, body, world, signal, scratch, bar,
-                    body_bar, signal_bar, thread, threads):  # fmt: skip
+                    body_bar, signal_bar, meeting, thread, threads):  # fmt: skip
     """Go back from the start of step `last` to the start of step `first`: the adjoint of `advance`.
 
     `bar` holds the adjoint of the state and is overwritten; `body_bar` and `signal_bar`
@@ -833,7 +838,8 @@ def advance_adjoint(states, grids, windows, logs, first, last, body, world, sign
         columns = range(thread * ni // threads, (thread + 1) * ni // threads)
         for a in columns:
             grid_update(grid, window, world, scratch, a)
-        meet(scratch.meeting, threads)
+        if not meet(meeting, threads):
+            return
         for k in own:
             p0, p1 = body.first[k], body.first[k + 1]
             w = windows[n, k]
@@ -844,15 +850,18 @@ def advance_adjoint(states, grids, windows, logs, first, last, body, world, sign
                 locate(old, world, tile, g0, g1)
                 locate_adjoint(old, world, tile, g0, g1)
                 g2p_adjoint(old, new, world, tile, scratch, window, bar, part, parts[k], g0, g1)
-        meet(scratch.meeting, threads)
+        if not meet(meeting, threads):
+            return
         for a in columns:
             add_blocks(parts, windows[n], window, a, scratch.velocity_bar)
             grid_update_adjoint(grid, window, world, scratch, a)
-        meet(scratch.meeting, threads)
+        if not meet(meeting, threads):
+            return
         if world.mirror_axis >= 0:
             if thread == 0:
                 mirror(scratch.node_bar, window, world)
-            meet(scratch.meeting, threads)
+            if not meet(meeting, threads):
+                return
         for k in own:
             p0, p1 = body.first[k], body.first[k + 1]
             for g0 in range(p0, p1, TILE):
@@ -881,11 +890,11 @@ def first_inverted(state, first, last):
 @jit
 def first_outside(state, world, first, last):
     """The first particle of groups of four that is off the grid, or is not a number."""
-    lo, hi = 0.5 * world.dx, -1.5 * world.dx
+    lo = 0.5 * world.dx
+    hi_x, hi_y = (world.nodes_x - 1.5) * world.dx, (world.nodes_y - 1.5) * world.dx
     for p in range(4 * first, 4 * last):
         x, y = state[12 * (p // 4), p % 4].real, state[12 * (p // 4) + 1, p % 4].real
-        inside_x = lo <= x < hi + world.nodes_x * world.dx
-        if not (inside_x and lo <= y < hi + world.nodes_y * world.dx):
+        if not (lo <= x < hi_x and lo <= y < hi_y):
             return p
     return -1
 
@@ -974,13 +983,14 @@ def positive(x):
 
 
 def logarithm(x):
-    """The natural logarithm of a positive number or record."""
+    """The natural logarithms of a record of positive numbers."""
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.log(x)
 
 
 def meet(meeting, threads):
-    """Wait until all threads are here."""
+    """Wait until all threads are here; whether they came, and none gave up."""
+    return True
 
 
 def real(x):
@@ -1492,7 +1502,7 @@ def _atomic_load(typingctx, array, k):
 
 
 # Turns of waiting before the processor is left to others, should they be more than processors.
-TURNS = 10_000
+TURNS = 500
 
 
 @intrinsic
@@ -1509,19 +1519,22 @@ def _give_way(typingctx):
 
 @overload(meet)
 def _overload_meet(meeting, threads):
-    # Number of meetings so far in meeting[8], of threads at this one in meeting[0].
+    # Threads at this meeting in meeting[0], meetings so far in [8], whether one gave up in [16].
     def implementation(meeting, threads):
         if threads == 1:
-            return
+            return True
         before = _atomic_load(meeting, 8)
         if _atomic_add(meeting, 0, 1) == threads - 1:
             _atomic_add(meeting, 0, -threads)
             _atomic_add(meeting, 8, 1)
-            return
+            return True
         turns = 0
         while _atomic_load(meeting, 8) == before:
             turns += 1
             if turns > TURNS:
+                if _atomic_load(meeting, 16) != 0:
+                    return False
                 _give_way()
+        return True
 
     return implementation

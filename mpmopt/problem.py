@@ -10,6 +10,7 @@ from scipy.spatial import KDTree
 
 from mpmopt.actuation import signal, signal_adjoint
 from mpmopt.checkpoints import Checkpointing
+from mpmopt.checks import number
 from mpmopt.design import DesignChain
 from mpmopt.errors import DesignError, SimulationError
 from mpmopt.objective import Objective
@@ -63,6 +64,11 @@ class Problem:
     chain : DesignChain
     size : int
         Number of design variables, D + 3 K.
+
+    Raises
+    ------
+    DesignError
+        If beta or `leave_out` makes no sense.
     """
 
     def __init__(
@@ -72,6 +78,9 @@ class Problem:
         checkpointing: Checkpointing | None = None,
         leave_out: float = 0.0,
     ) -> None:
+        leave_out = number("Problem", "leave_out", leave_out, error=DesignError)
+        if not 0.0 <= leave_out < 1.0:
+            raise DesignError(f"Problem: leave_out = {leave_out} must be at least 0 and below 1")
         self.scene = scene
         self.leave_out = leave_out
         self.checkpointing = checkpointing or Checkpointing()

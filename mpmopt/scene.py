@@ -14,6 +14,8 @@ import numpy as np
 from mpmopt.checks import MOST, count, number
 from mpmopt.errors import SceneError
 
+MOST_PASSES = 200  # of the design filter
+
 Vector = tuple[float, float]
 
 # s = a sin(...) + b with a and b within [-1, 1]
@@ -335,10 +337,12 @@ class Scene(_Checked):
                 f"Scene: filter_weights sum to w0 + 4 w1 + 4 w2 = {w0 + 4 * w1 + 4 * w2:.15g}, "
                 "must sum to 1"
             )
-        if not 0.0 <= self.filter_length <= max(self.grid.size):
+        if self.filter_length < 0.0:
+            raise SceneError(f"Scene: filter_length = {self.filter_length:g} must not be negative")
+        if self.filter_passes > MOST_PASSES:
             raise SceneError(
-                f"Scene: filter_length = {self.filter_length:g} must be from 0 to the grid's size "
-                f"{max(self.grid.size):g}"
+                f"Scene: filter_length = {self.filter_length:g} takes {self.filter_passes} passes, "
+                f"more than {MOST_PASSES}; take a shorter one, or larger w1 and w2"
             )
         self._check_body()
         self._check_walls()

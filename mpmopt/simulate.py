@@ -303,8 +303,12 @@ class _Segment:
                 signal,
                 self.scratch,
             )
+            nodes, part = self.grids.shape[1], self.scratch.parts.shape[1]
+            window = self.windows[reached % len(self.windows), :, 2:].prod(axis=1)
             if end == mpm.WINDOW_TOO_SMALL:
-                self.resize(2 * self.grids.shape[1], 2 * self.scratch.parts.shape[1])
+                self.resize(int(1.25 * window[-1]), part)
+            elif end == mpm.PART_TOO_SMALL:
+                self.resize(nodes, int(1.25 * window[:-1].max()))
             elif end != mpm.DONE:
                 shape = simulation.initial.shape
                 particle = min(particle, shape[1] - 1)
@@ -379,16 +383,16 @@ class Forward:
         schedule = self._checkpoints.schedule
         bar, count = mpm.grouped(seed, repeat=False), seed.shape[1]
         body_bar = mpm.BodyBar.zeros(len(simulation.body.mass))
-        blocks = memory.blocks
-        signal_bar = np.zeros((blocks, *simulation.signal.shape))
+        signal_bar = np.zeros_like(simulation.signal)
         segments = schedule.segments
         for index in range(len(segments) - 1, -1, -1):
             first, last = segments[index]
             if last < schedule.steps:
                 memory.recall(index, first, last, self._checkpoints)
+            part_bar = np.zeros((memory.blocks, *signal_bar[first:last].shape))
             for stop in range(last - first, 0, -simulation.steps_per_call):
                 together(
-                    blocks,
+                    memory.blocks,
                     mpm.advance_adjoint,
                     memory.states,
                     memory.grids,
@@ -402,13 +406,14 @@ class Forward:
                     memory.scratch,
                     bar,
                     body_bar,
-                    signal_bar[:, first:last],
+                    part_bar,
                 )
+            signal_bar[first:last] = part_bar.sum(axis=0)
         return Gradient(
             density=simulation.particles.volume * mpm.ungrouped(body_bar.mass, 1, count)[0],
             lame_lambda=mpm.ungrouped(body_bar.lame_lambda, 1, count)[0],
             lame_mu=mpm.ungrouped(body_bar.lame_mu, 1, count)[0],
-            signal=signal_bar.sum(axis=0),
+            signal=signal_bar,
             state=mpm.ungrouped(bar, mpm.STATE_SIZE, count),
         )
 

@@ -9,13 +9,22 @@ from collections.abc import Callable
 from functools import cache
 from typing import Any
 
+import numpy as np
+from numba import config
+
 from mpmopt.errors import MpmoptError
 
 logger = logging.getLogger(__name__)
 
 
+MEETING = 24  # numbers in the array at which threads meet
+GAVE_UP = 16  # the one of them that says that a thread gave up (`mpm.meet`)
+
+
 def threads() -> int:
     """Threads to use: ``MPMOPT_THREADS``, or as many as there are processors for this process.
+
+    One if Numba's compiler is off: only compiled loops can wait for each other.
 
     Raises
     ------
@@ -23,43 +32,64 @@ def threads() -> int:
         If the environment variable is not a whole number above zero.
     """
     wish = os.environ.get("MPMOPT_THREADS", "")
-    if not wish:
-        if hasattr(os, "sched_getaffinity"):
-            return len(os.sched_getaffinity(0))
-        return os.cpu_count() or 1
-    if not wish.isdecimal() or int(wish) < 1:
+    if wish and (not wish.isdecimal() or int(wish) < 1):
         raise MpmoptError(f"MPMOPT_THREADS = {wish!r} must be a whole number, at least 1")
-    return int(wish)
+    if getattr(config, "DISABLE_JIT", 0):
+        return 1
+    if wish:
+        return int(wish)
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def together(most: int, loop: Callable[..., Any], *arguments: Any) -> Any:
-    """Call ``loop(*arguments, thread, threads)`` in several threads at once, `most` at most.
+    """Call ``loop(*arguments, meeting, thread, threads)`` in several threads, `most` at most.
 
-    Returns the result of the first; all must return the same.
+    Returns the result of the first; all must return the same. If one fails, the others give up
+    where they wait for it (`mpm.meet`), and its exception is raised.
     """
     wanted = min(most, threads())
+    meeting = np.zeros(MEETING, np.int64)
     ready = threading.Event()
     started = 0
+    failures: list[BaseException] = []
+
+    def take_part(thread: int) -> Any:
+        try:
+            return loop(*arguments, meeting, thread, started)
+        except BaseException as error:
+            failures.append(error)
+            meeting[GAVE_UP] = 1
 
     def help_with(thread: int) -> None:
         ready.wait()
-        loop(*arguments, thread, started)
+        if thread < started:
+            take_part(thread)
 
     helpers = [threading.Thread(target=help_with, args=(k,), daemon=True) for k in range(1, wanted)]
-    why = ""
+    why, result = "", None
     try:
+        try:
+            for helper in helpers:
+                helper.start()
+        except RuntimeError as error:  # the system gives no more of them
+            why = str(error)
+        started = 1 + sum(helper.is_alive() for helper in helpers)
+        if started < wanted:
+            _say_once(f"{started} of {wanted} threads run: {why}")
+        ready.set()
+        result = take_part(0)
+    except BaseException:
+        meeting[GAVE_UP] = 1
+        raise
+    finally:
+        ready.set()
         for helper in helpers:
-            helper.start()
-    except RuntimeError as error:  # the system gives no more of them
-        why = str(error)
-    helpers = [helper for helper in helpers if helper.is_alive()]
-    started = 1 + len(helpers)
-    if started < wanted:
-        _say_once(f"{started} of {wanted} threads run: {why}")
-    ready.set()
-    result = loop(*arguments, 0, started)
-    for helper in helpers:
-        helper.join()
+            if helper.is_alive():
+                helper.join()
+    if failures:
+        raise failures[0]
     return result
 
 

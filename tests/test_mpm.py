@@ -30,7 +30,19 @@ def one_step(scene, state, signal=0.0, dtype=float):
     body, world = simulation.body, simulation.world
     scratch = mpm.Scratch.make(nodes, 1, nodes, dtype)
     reached, end, particle = mpm.advance(
-        states, grids, windows, logs, 0, 1, body, world, simulation.signal, scratch, 0, 1
+        states,
+        grids,
+        windows,
+        logs,
+        0,
+        1,
+        body,
+        world,
+        simulation.signal,
+        scratch,
+        np.zeros(24, np.int64),
+        0,
+        1,
     )
     assert (reached, end, particle) == (1, mpm.DONE, -1)
     # A is dropped when nodes have it; the same kernel gives it again.

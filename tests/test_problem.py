@@ -68,6 +68,12 @@ def test_void_that_is_left_out_is_not_simulated_and_the_gradient_stays_exact(pro
     assert without.value(sharp) == pytest.approx(with_void.value(sharp), rel=1e-7)
 
 
+@pytest.mark.parametrize("wrong", [np.nan, -1.0, 1.0, "a"])
+def test_a_senseless_limit_of_what_is_left_out_is_refused(scene, wrong):
+    with pytest.raises(DesignError, match="leave_out"):
+        Problem(scene, leave_out=wrong)
+
+
 def test_value_is_that_of_value_and_gradient(problem, x):
     value, gradient = problem.value_and_gradient(x)
     assert problem.value(x) == value

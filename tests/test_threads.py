@@ -5,14 +5,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import small_scene
 from crawler import crawler
+from numba import njit
 
-from mpmopt import threads
+from mpmopt import mpm, threads
 from mpmopt.checkpoints import Checkpointing
 from mpmopt.errors import MpmoptError, SimulationError
+from mpmopt.particles import lay_out
 from mpmopt.problem import Problem
-from mpmopt.scene import Solid, Wall
+from mpmopt.scene import Grid, Scene, Solid
+from mpmopt.simulate import Simulation, _Segment
+
+jit_loop = njit(nogil=True)
 
 
 def evaluated(scene, every=20):
@@ -51,19 +55,83 @@ def test_threads_that_do_not_start_are_done_without(monkeypatch, caplog):
     assert len([r for r in caplog.records if "1 of 3 threads run" in r.message]) == 1
 
 
-def test_a_failure_in_one_block_ends_all_threads(monkeypatch):
-    monkeypatch.setenv("MPMOPT_THREADS", "2")
+@jit_loop
+def wait_for_each_other(meeting, thread, threads):
+    return mpm.meet(meeting, threads)
+
+
+@pytest.mark.parametrize("failing", [0, 1, 2])
+@pytest.mark.parametrize("error", [KeyboardInterrupt, MemoryError])
+def test_no_thread_waits_for_one_that_failed(monkeypatch, failing, error):
+    monkeypatch.setenv("MPMOPT_THREADS", "3")
+    came = []
+
+    def loop(meeting, thread, number):
+        if thread == failing:
+            raise error("in one thread")
+        came.append(wait_for_each_other(meeting, thread, number))
+
+    before = threading.active_count()
+    with pytest.raises(error, match="in one thread"):
+        threads.together(3, loop)
+    assert threading.active_count() == before
+    assert came == [False, False]
+    came.clear()
+    assert threads.together(3, wait_for_each_other) is True
+
+
+def body_of(steps=40):
+    """Gravity-free, of several blocks, as a simulation with a state to spoil."""
     c = 1 / 64
-    # Heavy fall: the lowest particles, in several blocks, leave a grid without walls.
-    scene = small_scene(
-        grid=replace(small_scene().grid, cells=(64, 64), dx=c), walls=(Wall("x", 2 * c),),
-        gravity=(0.0, -10.0), steps=500, time_step=1e-3,
-        body=(Solid((3 * c, 4 * c), (23 * c, 14 * c)),),
-    )  # fmt: skip
-    with pytest.raises(SimulationError, match="left the grid") as caught:
-        problem = Problem(scene)
-        problem.value(np.empty(0))
-    assert 0 <= caught.value.particle < len(problem.particles.position)
+    scene = Scene(Grid((64, 64), c), 1e-3, steps, body=(Solid((10 * c, 10 * c), (40 * c, 30 * c)),))
+    particles = lay_out(scene)
+    ones = np.ones(len(particles.position))
+    state = np.zeros((12, len(ones)))
+    state[0:2], state[8], state[11] = particles.position.T, 1.0, 1.0
+
+    def simulation(state):
+        signal = np.zeros((steps, 0))
+        return Simulation(scene, particles, ones, 10 * ones, 10 * ones, signal, state)
+
+    return simulation, state
+
+
+@pytest.mark.parametrize("particle", [3, 2397])
+def test_a_failure_in_one_block_ends_all_threads(monkeypatch, particle):
+    monkeypatch.setenv("MPMOPT_THREADS", "2")
+    simulation, state = body_of()
+    spoilt = simulation(state)
+    assert len(spoilt.body.first) - 1 == 6
+    spoilt.initial[8, particle] = -1.0  # inverted, in the first or the last block
+    with pytest.raises(SimulationError, match="inverted") as caught:
+        spoilt.run()
+    assert caught.value.particle == particle
+
+
+@pytest.mark.parametrize("number", ["1", "2"])
+def test_windows_that_outgrow_their_room_get_what_they_need_and_change_no_bit(monkeypatch, number):
+    monkeypatch.setenv("MPMOPT_THREADS", number)
+    simulation, state = body_of()
+    state[2] = 3.0
+    falling = simulation(state)
+    room = falling.room
+    ends = set()
+    for nodes, part in (room, (10, room[1]), (room[0], 10), (10, 10)):
+        memory = _Segment(falling, 20)
+        memory.grids = memory.grids[:, :0]
+        memory.resize(nodes, part)
+        memory.states[0] = mpm.grouped(falling.initial)
+        memory.advance(0, 20)
+        ends.add(memory.states[20].tobytes())
+        assert memory.grids.shape[1] <= room[0]
+        assert memory.scratch.parts.shape[1] <= room[1]
+    assert len(ends) == 1
+
+
+def test_without_the_compiler_there_is_one_thread(monkeypatch):
+    monkeypatch.setattr("numba.config.DISABLE_JIT", 1)
+    monkeypatch.setenv("MPMOPT_THREADS", "2")
+    assert threads.threads() == 1
 
 
 @pytest.mark.parametrize("wish", ["0", "-1", "two", "1.5"])
