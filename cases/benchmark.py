@@ -14,7 +14,6 @@ import importlib
 import importlib.metadata
 import os
 import platform
-import resource
 import subprocess
 import sys
 import tempfile
@@ -71,6 +70,7 @@ def in_turns(runs: Mapping[str, Run], rounds: int) -> dict[str, np.ndarray]:
             run()
             if number:
                 seconds[name].append(time.perf_counter() - began)
+    os.environ.pop("MPMOPT_THREADS", None)
     return {name: np.array(values) for name, values in seconds.items()}
 
 
@@ -200,7 +200,10 @@ def print_peak_memory(contestant: str, steps: int) -> None:
     else:
         peer = importlib.import_module(f"peers.{contestant}").prepare(simulation, objective)
         peer.value_and_gradient()
-    print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
+    import resource  # not on Windows
+
+    unit = 1024**2 if sys.platform == "darwin" else 1024
+    print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit)
 
 
 def peers(steps: int, rounds: int) -> str:

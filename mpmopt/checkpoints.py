@@ -35,7 +35,7 @@ class Checkpointing:
     memory : int, optional
         Budget in bytes for states, store included unless it is on disk.
     store : "memory", "disk" or Path, optional
-        Where checkpoints go: HDF5's core driver, a scratch file in the system's temporary folder
+        Where checkpoints go: plain arrays, a scratch file (HDF5) in the system's temporary folder
         that is removed at the end, or a file that is kept.
 
     Raises

@@ -163,11 +163,11 @@ def plot_history(path: Path, run: Optimisation) -> None:
     for start in _starts(stages):
         axes.axvline(start + 0.5, color="0.7", lw=0.8)
         axes.annotate(
-            f" $\\beta$ = {history[start].beta:g}", (start + 0.5, 1.0),
-            xycoords=("data", "axes fraction"), va="top", fontsize=8,
+            f"$\\beta$ = {history[start].beta:g}", (start + 0.5, 1.01), rotation=90,
+            xycoords=("data", "axes fraction"), ha="center", va="bottom", fontsize=7,
         )  # fmt: skip
     axes.legend(lines, [line.get_label() for line in lines], loc="center right")
-    axes.set_title("History of the optimisation")
+    axes.set_title("History of the optimisation", pad=32.0)
     figure.savefig(path, dpi=120)
 
 
