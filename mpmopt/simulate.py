@@ -289,15 +289,17 @@ class _Segment:
         signal = simulation.signal[first:last]
         reached, steps = 0, last - first
         while reached < steps:
+            stop = min(steps, reached + simulation.steps_per_call)
             reached, end, particle = together(
                 self.blocks,
+                (stop - reached) * len(self.states[0]),
                 mpm.advance,
                 self.states,
                 self.grids,
                 self.windows,
                 self.logs,
                 reached,
-                min(steps, reached + simulation.steps_per_call),
+                stop,
                 simulation.body,
                 simulation.world,
                 signal,
@@ -391,14 +393,16 @@ class Forward:
                 memory.recall(index, first, last, self._checkpoints)
             part_bar = np.zeros((memory.blocks, *signal_bar[first:last].shape))
             for stop in range(last - first, 0, -simulation.steps_per_call):
+                start = max(0, stop - simulation.steps_per_call)
                 together(
                     memory.blocks,
+                    (stop - start) * len(bar),
                     mpm.advance_adjoint,
                     memory.states,
                     memory.grids,
                     memory.windows,
                     memory.logs,
-                    max(0, stop - simulation.steps_per_call),
+                    start,
                     stop,
                     simulation.body,
                     simulation.world,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import threading
+import time
 from collections.abc import Callable
 from functools import cache
 from typing import Any
@@ -19,6 +20,44 @@ logger = logging.getLogger(__name__)
 
 MEETING = 24  # numbers in the array at which threads meet
 GAVE_UP = 16  # the one of them that says that a thread gave up (`mpm.meet`)
+
+
+# How many calls of a loop pass between tries of what was slower: one thread, or all.
+SOON, LATE = 16, 512
+
+
+class Pace:
+    """Is a loop faster with one thread or with all, on a machine that others use too?
+
+    Threads wait for each other, so a processor that is busy elsewhere can make all of them slower
+    than one alone. As the number of threads changes no result, it may change at any time.
+    """
+
+    def __init__(self) -> None:
+        self.seconds: dict[bool, float] = {}  # per unit of work, of all (True) or one (False)
+        self.pause, self.since = SOON, -1  # the first call compiles and does not count
+
+    def choose(self) -> bool:
+        """Whether the next call gets all threads."""
+        if self.since < 0 or True not in self.seconds:
+            return True
+        if False not in self.seconds:
+            return False
+        faster = self.seconds[True] <= self.seconds[False]
+        return faster if self.since < self.pause else not faster
+
+    def note(self, with_all: bool, seconds: float) -> None:
+        """Remember what a unit of work took."""
+        if self.since >= 0:
+            self.seconds[with_all] = seconds
+            if self.since >= self.pause:
+                other = self.seconds.get(not with_all, np.inf)
+                self.pause = SOON if seconds < other else min(2 * self.pause, LATE)
+                self.since = 0
+        self.since += 1
+
+
+_paces: dict[str, Pace] = {}
 
 
 def threads() -> int:
@@ -43,13 +82,26 @@ def threads() -> int:
     return os.cpu_count() or 1
 
 
-def together(most: int, loop: Callable[..., Any], *arguments: Any) -> Any:
+def together(most: int, work: int, loop: Callable[..., Any], *arguments: Any) -> Any:
     """Call ``loop(*arguments, meeting, thread, threads)`` in several threads, `most` at most.
 
     Returns the result of the first; all must return the same. If one fails, the others give up
-    where they wait for it (`mpm.meet`), and its exception is raised.
+    where they wait for it (`mpm.meet`), and its exception is raised. How many there are is decided
+    by ``MPMOPT_THREADS``, or, if that is not set, by which number did such `work` faster lately.
     """
     wanted = min(most, threads())
+    if wanted == 1 or os.environ.get("MPMOPT_THREADS"):
+        return _call(wanted, loop, *arguments)
+    pace = _paces.setdefault(loop.__name__, Pace())
+    with_all = pace.choose()
+    began = time.perf_counter()
+    result = _call(wanted if with_all else 1, loop, *arguments)
+    pace.note(with_all, (time.perf_counter() - began) / work)
+    return result
+
+
+def _call(wanted: int, loop: Callable[..., Any], *arguments: Any) -> Any:
+    """Call the loop with so many threads, or as many as start."""
     meeting = np.zeros(MEETING, np.int64)
     ready = threading.Event()
     started = 0

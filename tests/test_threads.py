@@ -73,11 +73,11 @@ def test_no_thread_waits_for_one_that_failed(monkeypatch, failing, error):
 
     before = threading.active_count()
     with pytest.raises(error, match="in one thread"):
-        threads.together(3, loop)
+        threads.together(3, 1, loop)
     assert threading.active_count() == before
     assert came == [False, False]
     came.clear()
-    assert threads.together(3, wait_for_each_other) is True
+    assert threads.together(3, 1, wait_for_each_other) is True
 
 
 def body_of(steps=40):
@@ -126,6 +126,47 @@ def test_windows_that_outgrow_their_room_get_what_they_need_and_change_no_bit(mo
         assert memory.grids.shape[1] <= room[0]
         assert memory.scratch.parts.shape[1] <= room[1]
     assert len(ends) == 1
+
+
+def test_the_faster_number_of_threads_is_taken_and_the_other_tried_again():
+    pace, taken = threads.Pace(), []
+    seconds = {True: 10.0, False: 1.0}  # busy: all threads wait for one another
+
+    def calls(number):
+        for _ in range(number):
+            with_all = pace.choose()
+            taken.append(with_all)
+            pace.note(with_all, 100.0 if len(taken) == 1 else seconds[with_all])
+
+    calls(1000)
+    # The first call compiles; then each once; then alone, but for tries that become rare.
+    assert taken[:3] == [True, True, False]
+    tries = np.flatnonzero(taken)[2:]
+    assert 4 <= len(tries) <= 8
+    assert np.all(np.diff(tries)[1:] >= np.diff(tries)[:-1])
+    seconds[True] = 0.5  # quiet again
+    taken.clear()
+    taken.append(False)
+    calls(3 * threads.LATE)
+    assert np.mean(taken[threads.LATE + 2 :]) > 0.9
+
+
+def test_a_wish_for_a_number_of_threads_is_kept(monkeypatch):
+    monkeypatch.setenv("MPMOPT_THREADS", "2")
+    seen = []
+    for _ in range(3):
+        threads.together(2, 1, lambda meeting, thread, number: seen.append(number))
+    assert seen == [2] * 6
+    monkeypatch.delenv("MPMOPT_THREADS")
+    monkeypatch.setattr(threads, "threads", lambda: 2)
+    seen.clear()
+
+    def loop(meeting, thread, number):
+        seen.append(number)
+
+    for _ in range(3):
+        threads.together(2, 1, loop)
+    assert seen == [2, 2, 2, 2, 1]
 
 
 def test_without_the_compiler_there_is_one_thread(monkeypatch):
