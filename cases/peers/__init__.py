@@ -1,0 +1,1 @@
+"""The simulation in three differentiable peers, each with its own automatic differentiation."""

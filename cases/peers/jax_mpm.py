@@ -1,0 +1,226 @@
+"""The steps of `mpmopt.mpm` in JAX: a scan of checkpointed steps under jit, differentiated by grad.
+
+A step takes particles from one grid to the next, so that positions, deformation gradients and nodes
+are all that the scan carries.
+"""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from numpy.typing import NDArray
+
+from mpmopt import mpm
+from mpmopt.objective import Objective
+from mpmopt.simulate import Simulation
+
+jax.config.update("jax_enable_x64", True)
+
+NAME = f"JAX {jax.__version__} jit, checkpointed scan"
+
+
+def window(simulation: Simulation) -> tuple[NDArray, NDArray]:
+    """First node and size of a window of nodes that the body never leaves."""
+    steps = simulation.steps
+    run = simulation.run(frames=range(0, steps + 1, 5))[:, 0:2].real / simulation.world.dx - 0.5
+    low = run.min(axis=(0, 2)).astype(int) - 2
+    high = run.max(axis=(0, 2)).astype(int) + 5
+    return low, high - low
+
+
+class Peer:
+    """The compiled forward run and its gradient."""
+
+    def __init__(self, run, args, volume):
+        options = {"xla_cpu_enable_fast_math": True}
+        self.args, self.volume = args, volume
+        self.forward = jax.jit(run, compiler_options=options)
+        self.gradient = jax.jit(
+            jax.value_and_grad(run, argnums=(0, 1, 2, 3)), compiler_options=options
+        )
+
+    def value(self) -> float:
+        """Objective."""
+        return float(self.forward(*self.args))
+
+    def value_and_gradient(self) -> tuple[float, dict[str, NDArray[np.float64]]]:
+        """Objective and its derivatives."""
+        value, bars = self.gradient(*self.args)
+        mass, lam, mu, signal = (np.asarray(bar) for bar in bars)
+        names = {"density": self.volume * mass, "lame_lambda": lam, "lame_mu": mu}
+        return float(value), {**names, "signal": signal}
+
+
+def prepare(simulation: Simulation, objective: Objective) -> Peer:
+    """The scene of a simulation, ready to run in JAX."""
+    world, body = simulation.world, simulation.body
+    N = simulation.initial.shape[1]
+    K = len(body.actuation_stress)
+    low, size = window(simulation)
+    i0, j0, ni, nj = int(low[0]), int(low[1]), int(size[0]), int(size[1])
+    M = ni * nj
+    dt, dx = world.dt, world.dx
+    inv, scale = 1 / dx, 4 / dx**2
+    gravity = dt * np.array([world.gravity_x, world.gravity_y])
+    if world.mirror_axis >= 0 or not np.all(np.isinf(world.wall_friction)):
+        raise NotImplementedError("only sticking walls and no mirror planes")
+    lo, hi = [0, 0], [world.nodes_x, world.nodes_y]
+    for axis, side, node in zip(world.wall_axis, world.wall_side, world.wall_node):
+        if side > 0:
+            lo[axis] = max(lo[axis], int(node))
+        else:
+            hi[axis] = min(hi[axis], int(node))
+    ii, jj = np.meshgrid(np.arange(i0, i0 + ni), np.arange(j0, j0 + nj), indexing="ij")
+    below = np.stack([ii < lo[0], jj < lo[1]], -1).reshape(M, 2)
+    above = np.stack([ii > hi[0], jj > hi[1]], -1).reshape(M, 2)
+
+    def ungroup(records):
+        return mpm.ungrouped(records, 1, N)[0]
+
+    volume = ungroup(body.volume)
+    impulse = dt * scale * volume
+    actuator = simulation.particles.actuator
+    onehot = (actuator == np.arange(K)[:, None]).astype(float)
+    S = body.actuation_stress
+    st = simulation.initial.real
+    w_obj = objective.weight
+    ex, ey = objective.direction
+
+    def near(x, y):
+        i = (x * inv - 0.5).astype(jnp.int32)
+        j = (y * inv - 0.5).astype(jnp.int32)
+        fx, fy = x * inv - i, y * inv - j
+        node = (i - i0) * nj + (j - j0)
+        return node[:, None] + nj * np.arange(3, dtype=np.int32), fx, fy
+
+    def wts(f):
+        return 0.5 * (1.5 - f) ** 2, 0.75 - (f - 1.0) ** 2, 0.5 * (f - 0.5) ** 2
+
+    def scatter(idx, vals):
+        dn = lax.ScatterDimensionNumbers(
+            update_window_dims=(2,), inserted_window_dims=(), scatter_dims_to_operand_dims=(0,)
+        )
+        return lax.scatter_add(
+            jnp.zeros(M * 3), (3 * idx)[..., None], vals, dn, mode="promise_in_bounds"
+        )
+
+    def gather(u, idx):
+        return lax.gather(
+            u,
+            (2 * idx)[..., None],
+            lax.GatherDimensionNumbers((2,), (), (0,)),
+            (6,),
+            mode="promise_in_bounds",
+        )
+
+    def p2g(mat, n_signal, x, y, u, v, C, F):
+        m, lam, mu = mat
+        c00, c01, c10, c11 = C
+        f00, f01, f10, f11 = F
+        idx, fx, fy = near(x, y)
+        s00 = mu
+        s01 = 0.0
+        s11 = mu
+        for k in range(K):
+            sk = n_signal[k] * onehot[k]
+            s00 = s00 + sk * S[k, 0]
+            s01 = s01 + sk * S[k, 1]
+            s11 = s11 + sk * S[k, 2]
+        pr = lam * jnp.log(f00 * f11 - f01 * f10) - mu
+        h00, h01 = f00 * s00 + f01 * s01, f00 * s01 + f01 * s11
+        h10, h11 = f10 * s00 + f11 * s01, f10 * s01 + f11 * s11
+        t00 = h00 * f00 + h01 * f01 + pr
+        t01 = h00 * f10 + h01 * f11
+        t11 = h10 * f10 + h11 * f11 + pr
+        a00 = m * c00 - impulse * t00
+        a01 = m * c01 - impulse * t01
+        a10 = m * c10 - impulse * t01
+        a11 = m * c11 - impulse * t11
+        (m, u, v, a00, a01, a10, a11, fx, fy) = (m, u, v, a00, a01, a10, a11, fx, fy)
+        wx, wy = (wts(fx), wts(fy))
+        z = jnp.zeros_like(m)
+        q = jnp.stack([m * u, m * v, m], 1)
+        A0 = jnp.stack([a00, a10, z], 1) * dx
+        A1 = jnp.stack([a01, a11, z], 1) * dx
+        wx = jnp.stack(wx, 1)
+        wy = jnp.stack(wy, 1)
+        r = np.arange(3.0)
+        vals = (wx[:, :, None] * wy[:, None, :])[..., None] * (
+            (q[:, None, :] + (r - fx[:, None])[:, :, None] * A0[:, None, :])[:, :, None, :]
+            + ((r - fy[:, None])[:, :, None] * A1[:, None, :])[:, None, :, :]
+        )
+        vals = vals.reshape(N, 3, 9)
+        return scatter(idx, vals)
+
+    def grid_update(g):
+        g = g.reshape(M, 3)
+        m = g[:, 2:]
+        has = m > 0.0
+        vel = jnp.where(has, g[:, :2] / jnp.where(has, m, 1.0) + gravity, 0.0)
+        stuck = jnp.any((below & (vel < 0.0)) | (above & (vel > 0.0)), axis=1, keepdims=True)
+        return jnp.where(stuck, 0.0, vel).reshape(-1)
+
+    def g2p(vel, x, y):
+        idx, fx, fy = near(x, y)
+        G = gather(vel, idx)
+        fx, fy = (fx, fy)
+        wx, wy = (wts(fx), wts(fy))
+        s = scale * dx
+        G = G.reshape(N, 3, 3, 2)
+        wx = jnp.stack(wx, 1)
+        wy = jnp.stack(wy, 1)
+        r = np.arange(3.0)
+        wr = wy * (r - fy[:, None])
+        R = (wy[:, None, :, None] * G).sum(2)
+        Rr = (wr[:, None, :, None] * G).sum(2)
+        V = (wx[:, :, None] * R).sum(1)
+        c0 = ((wx * (r - fx[:, None]))[:, :, None] * R).sum(1)
+        c1 = (wx[:, :, None] * Rr).sum(1)
+        return V[:, 0], V[:, 1], (s * c0[:, 0], s * c1[:, 0], s * c0[:, 1], s * c1[:, 1])
+
+    def deform(C, F):
+        c00, c01, c10, c11 = C
+        f00, f01, f10, f11 = F
+        return (
+            f00 + dt * (c00 * f00 + c01 * f10),
+            f01 + dt * (c00 * f01 + c01 * f11),
+            f10 + dt * (c10 * f00 + c11 * f10),
+            f11 + dt * (c10 * f01 + c11 * f11),
+        )
+
+    def step(mat, carry, sig):
+        x, y, F, vel = carry
+        u, v, C = g2p(vel, x, y)
+        x, y = x + dt * u, y + dt * v
+        x, y, u, v, C = (x, y, u, v, C)
+        F = deform(C, F)
+        g = p2g(mat, sig, x, y, u, v, C, F)
+        return (x, y, F, grid_update(g)), None
+
+    def run(m, lam, mu, signal):
+        mat = (m, lam, mu)
+        x, y = st[0], st[1]
+        C = tuple(st[4:8])
+        F = deform(C, tuple(st[8:12]))
+        vel = grid_update(p2g(mat, signal[0], x, y, st[2], st[3], C, F))
+        carry = (jnp.asarray(x), jnp.asarray(y), F, vel)
+        f = partial(step, mat)
+        carry, _ = lax.scan(jax.checkpoint(f), carry, signal[1:])
+        x, y, F, vel = carry
+        u, v, _ = g2p(vel, x, y)
+        x, y = x + dt * u, y + dt * v
+        V = w_obj * (F[0] * F[3] - F[1] * F[2])
+        return (V * (ex * x + ey * y)).sum() / V.sum()
+
+    args = tuple(
+        jnp.array(a)
+        for a in (
+            ungroup(body.mass),
+            ungroup(body.lame_lambda),
+            ungroup(body.lame_mu),
+            simulation.signal,
+        )
+    )
+    return Peer(run, args, volume)
