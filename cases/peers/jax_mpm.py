@@ -30,6 +30,15 @@ def window(simulation: Simulation) -> tuple[NDArray, NDArray]:
     return low, high - low
 
 
+def kept(values):
+    """The same values, computed once: XLA on the CPU repeats what it fuses, but no conditional.
+
+    `lax.optimization_barrier` is dropped there before fusion.
+    """
+    first = jax.tree.leaves(values)[0].ravel()[0]
+    return lax.cond(first < 1e300, lambda v: v, lambda v: jax.tree.map(jnp.zeros_like, v), values)
+
+
 class Peer:
     """The compiled forward run and its gradient."""
 
@@ -138,20 +147,17 @@ def prepare(simulation: Simulation, objective: Objective) -> Peer:
         a01 = m * c01 - impulse * t01
         a10 = m * c10 - impulse * t01
         a11 = m * c11 - impulse * t11
-        (m, u, v, a00, a01, a10, a11, fx, fy) = (m, u, v, a00, a01, a10, a11, fx, fy)
+        m, u, v, a00, a01, a10, a11, fx, fy = kept((m, u, v, a00, a01, a10, a11, fx, fy))
         wx, wy = (wts(fx), wts(fy))
-        z = jnp.zeros_like(m)
-        q = jnp.stack([m * u, m * v, m], 1)
-        A0 = jnp.stack([a00, a10, z], 1) * dx
-        A1 = jnp.stack([a01, a11, z], 1) * dx
-        wx = jnp.stack(wx, 1)
-        wy = jnp.stack(wy, 1)
-        r = np.arange(3.0)
-        vals = (wx[:, :, None] * wy[:, None, :])[..., None] * (
-            (q[:, None, :] + (r - fx[:, None])[:, :, None] * A0[:, None, :])[:, :, None, :]
-            + ((r - fy[:, None])[:, :, None] * A1[:, None, :])[:, None, :, :]
-        )
-        vals = vals.reshape(N, 3, 9)
+        out = []
+        for a in range(3):
+            rx = (a - fx) * dx
+            qx, qy, qm = wx[a] * (m * u + rx * a00), wx[a] * (m * v + rx * a10), wx[a] * m
+            bx, by = wx[a] * a01, wx[a] * a11
+            for b in range(3):
+                ry = (b - fy) * dx
+                out += [wy[b] * (qx + ry * bx), wy[b] * (qy + ry * by), wy[b] * qm]
+        vals = jnp.stack(out, 1).reshape(N, 3, 9)
         return scatter(idx, vals)
 
     def grid_update(g):
@@ -165,20 +171,22 @@ def prepare(simulation: Simulation, objective: Objective) -> Peer:
     def g2p(vel, x, y):
         idx, fx, fy = near(x, y)
         G = gather(vel, idx)
-        fx, fy = (fx, fy)
+        fx, fy = kept((fx, fy))
         wx, wy = (wts(fx), wts(fy))
         s = scale * dx
-        G = G.reshape(N, 3, 3, 2)
-        wx = jnp.stack(wx, 1)
-        wy = jnp.stack(wy, 1)
-        r = np.arange(3.0)
-        wr = wy * (r - fy[:, None])
-        R = (wy[:, None, :, None] * G).sum(2)
-        Rr = (wr[:, None, :, None] * G).sum(2)
-        V = (wx[:, :, None] * R).sum(1)
-        c0 = ((wx * (r - fx[:, None]))[:, :, None] * R).sum(1)
-        c1 = (wx[:, :, None] * Rr).sum(1)
-        return V[:, 0], V[:, 1], (s * c0[:, 0], s * c1[:, 0], s * c0[:, 1], s * c1[:, 1])
+        # Not slices: their transpose is a sum of padded arrays, that of a split a concatenation.
+        G = [g[0] for g in lax.split(G.reshape(N, 18).T, [1] * 18, axis=0)]
+        moved = []
+        for c in range(2):
+            V = c0 = c1 = 0.0
+            for a in range(3):
+                r0, r1, r2 = (wy[b] * G[6 * a + 2 * b + c] for b in range(3))
+                row = wx[a] * (r0 + r1 + r2)
+                V, c0 = V + row, c0 + (a - fx) * row
+                c1 = c1 + wx[a] * ((0 - fy) * r0 + (1 - fy) * r1 + (2 - fy) * r2)
+            moved.append((V, s * c0, s * c1))
+        (u, c00, c01), (v, c10, c11) = moved
+        return u, v, (c00, c01, c10, c11)
 
     def deform(C, F):
         c00, c01, c10, c11 = C
@@ -194,10 +202,10 @@ def prepare(simulation: Simulation, objective: Objective) -> Peer:
         x, y, F, vel = carry
         u, v, C = g2p(vel, x, y)
         x, y = x + dt * u, y + dt * v
-        x, y, u, v, C = (x, y, u, v, C)
+        x, y, u, v, C = kept((x, y, u, v, C))
         F = deform(C, F)
         g = p2g(mat, sig, x, y, u, v, C, F)
-        return (x, y, F, grid_update(g)), None
+        return (x, y, F, grid_update(kept(g))), None
 
     def run(m, lam, mu, signal):
         mat = (m, lam, mu)

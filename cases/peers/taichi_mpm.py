@@ -18,7 +18,6 @@ from mpmopt.simulate import Simulation
 NAME = f"Taichi {'.'.join(map(str, ti.__version__))} autodiff"
 
 real = ti.f64
-BLOCK = 512  # particles of a task
 
 
 @dataclass
@@ -104,7 +103,7 @@ def prepare(simulation: Simulation, objective: Objective) -> Peer:
 
     @ti.kernel
     def start():
-        ti.loop_config(block_dim=BLOCK)
+        ti.loop_config(serialize=True)  # no atomics then
         for p in range(N):
             Fp = F[0, p] + dt * C0[p] @ F[0, p]
             F[1, p] = Fp
@@ -112,7 +111,7 @@ def prepare(simulation: Simulation, objective: Objective) -> Peer:
 
     @ti.kernel
     def move(n: ti.i32):
-        ti.loop_config(block_dim=BLOCK)
+        ti.loop_config(serialize=True)  # no atomics then
         for p in range(N):
             xp = x[n, p]
             base = ti.cast(xp * inv - 0.5, ti.i32)
@@ -152,7 +151,7 @@ def prepare(simulation: Simulation, objective: Objective) -> Peer:
 
     @ti.kernel
     def update(n: ti.i32):
-        ti.loop_config(block_dim=BLOCK)
+        ti.loop_config(serialize=True)  # no atomics then
         for i in range(nodes):
             m = grid[n, i][2]
             if m > 0.0:

@@ -18,7 +18,8 @@ from mpmopt.simulate import Simulation
 NAME = f"Warp {wp.__version__} tape"
 
 wp.config.quiet = True
-wp.set_module_options({"enable_backward": True})
+flags = wp.config.cpu_compiler_flags or "-march=native"
+wp.set_module_options({"enable_backward": True, "cpu_compiler_flags": f"{flags} -ffast-math"})
 
 real = wp.float64
 vec2, vec4, mat22 = wp.vec2d, wp.vec4d, wp.mat22d
