@@ -41,19 +41,6 @@ class Setup:
     high: wp.vec2i
 
 
-@wp.struct
-class Body:
-    """Constants of the particles; `actuator` is -1 for none."""
-
-    volume: wp.array(dtype=real)
-    mass: wp.array(dtype=real)
-    lame_lambda: wp.array(dtype=real)
-    lame_mu: wp.array(dtype=real)
-    actuator: wp.array(dtype=int)
-    stress: wp.array(dtype=mat22)
-    signal: wp.array2d(dtype=real)
-
-
 @wp.func
 def cell(x: vec2, setup: Setup):
     """Base node of a position."""
