@@ -7,11 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from mpmopt.binary import THRESHOLD, distance
 from mpmopt.errors import SceneError, SimulationError
-from mpmopt.particles import lay_out
+from mpmopt.particles import lay_out, nearest_designed
 from mpmopt.problem import Problem
 from mpmopt.scene import Grid, Scene
 
@@ -82,7 +81,6 @@ def audit(problem: Problem, x: NDArray[np.float64]) -> list[Audited]:
     """
     variables = problem.split(x)
     solid = problem.gamma(x) >= THRESHOLD
-    body = problem.particles.position[problem.particles.designed]
     scene = problem.scene
     variants: dict[str, Callable[[], Scene]] = {
         "as designed": lambda: scene,
@@ -95,9 +93,7 @@ def audit(problem: Problem, x: NDArray[np.float64]) -> list[Audited]:
         there = scene
         try:
             there = make()
-            particles = lay_out(there)
-            position = particles.position[particles.designed]
-            keep = solid[KDTree(body).query(position)[1]] if len(body) else solid
+            keep = solid[nearest_designed(lay_out(there), problem.particles)]
             reference = distance(there, np.ones_like(keep), variables)
             row = Audited(name, there.grid.cells, there.time_step, reference)
             row = replace(row, distance=distance(there, keep, variables))

@@ -34,6 +34,14 @@ def number(
     return result
 
 
+def share(owner: str, name: str, value: Any, *, error: type[MpmoptError] = SceneError) -> float:
+    """`value` as a float from 0 to below 1, or an error."""
+    result = number(owner, name, value, error=error)
+    if not 0.0 <= result < 1.0:
+        raise error(f"{owner}: {name} = {result} must be at least 0 and below 1")
+    return result
+
+
 def count(
     owner: str, name: str, value: Any, least: int, *, error: type[MpmoptError] = SceneError
 ) -> int:

@@ -978,7 +978,7 @@ def total(x):
 
 
 def positive(x):
-    """Whether a number, or all of a record, are above zero; what is not a number is not."""
+    """Whether the real parts of a record are all above zero; what is not a number is not."""
     return bool(np.all(np.real(x) > 0.0))
 
 
@@ -1297,7 +1297,6 @@ for _symbol, _name in (
     (operator.add, "fadd"),
     (operator.sub, "fsub"),
     (operator.mul, "fmul"),
-    (operator.iadd, "fadd"),
 ):
     _overload_arithmetic(_symbol, _name)
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from mpmopt.binary import post_processed
 from mpmopt.checkpoints import Checkpointing
-from mpmopt.checks import count, number
+from mpmopt.checks import count, number, share
 from mpmopt.design import greyness
 from mpmopt.errors import DesignError, SimulationError
 from mpmopt.mma import MovingAsymptotes
@@ -74,9 +74,7 @@ class Stage:
             object.__setattr__(self, name, value)
         if self.move_limit > 1.0:
             raise DesignError(f"Stage: move_limit = {self.move_limit} must be at most 1")
-        leave_out = number("Stage", "leave_out", self.leave_out, error=DesignError)
-        if not 0.0 <= leave_out < 1.0:
-            raise DesignError(f"Stage: leave_out = {leave_out} must be at least 0 and below 1")
+        leave_out = share("Stage", "leave_out", self.leave_out, error=DesignError)
         object.__setattr__(self, "leave_out", leave_out)
         if self.most_iterations is not None:
             most = count("Stage", "most_iterations", self.most_iterations, 1, error=DesignError)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from mpmopt.scene import Actuator, Design, Scene
 
@@ -87,3 +88,9 @@ def mirror_images(scene: Scene, half: Particles, whole: Particles) -> NDArray[np
         return index[:, 0] * row + index[:, 1]
 
     return np.searchsorted(cell(half.position), cell(folded))
+
+
+def nearest_designed(particles: Particles, others: Particles) -> NDArray[np.int64]:
+    """Index of the design particle of `others` that is nearest to each of `particles`' own."""
+    here, there = (each.position[each.designed] for each in (particles, others))
+    return KDTree(there).query(here)[1] if len(here) else np.empty(0, np.int64)

@@ -6,15 +6,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from mpmopt.actuation import signal, signal_adjoint
 from mpmopt.checkpoints import Checkpointing
-from mpmopt.checks import number
+from mpmopt.checks import share
 from mpmopt.design import DesignChain
 from mpmopt.errors import DesignError, SimulationError
 from mpmopt.objective import Objective
-from mpmopt.particles import lay_out
+from mpmopt.particles import lay_out, nearest_designed
 from mpmopt.scene import Scene
 from mpmopt.simulate import Simulation
 
@@ -78,11 +77,8 @@ class Problem:
         checkpointing: Checkpointing | None = None,
         leave_out: float = 0.0,
     ) -> None:
-        leave_out = number("Problem", "leave_out", leave_out, error=DesignError)
-        if not 0.0 <= leave_out < 1.0:
-            raise DesignError(f"Problem: leave_out = {leave_out} must be at least 0 and below 1")
         self.scene = scene
-        self.leave_out = leave_out
+        self.leave_out = share("Problem", "leave_out", leave_out, error=DesignError)
         self.checkpointing = checkpointing or Checkpointing()
         self.particles = lay_out(scene)
         self.chain = DesignChain(scene, self.particles, beta)
@@ -130,9 +126,8 @@ class Problem:
 
         Each design particle takes phi from the nearest one of the other problem's.
         """
-        positions = [p.particles.position[p.particles.designed] for p in (other, self)]
         parts = other.split(x)
-        phi = parts.phi[KDTree(positions[0]).query(positions[1])[1]] if self._designed else 0.0
+        phi = parts.phi[nearest_designed(self.particles, other.particles)]
         return self.join(phi, parts.a, parts.theta, parts.b)
 
     def gamma(self, x: NDArray) -> NDArray:

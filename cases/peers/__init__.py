@@ -1,1 +1,37 @@
-"""The simulation in three differentiable peers, each with its own automatic differentiation."""
+"""The walker's scene in libraries that differentiate by themselves, for the benchmark."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpmopt.mpm import World, ungrouped
+from mpmopt.simulate import Simulation
+
+
+def window(simulation: Simulation) -> tuple[NDArray, NDArray]:
+    """First node and size of a window of nodes that the body never leaves."""
+    steps = simulation.steps
+    run = simulation.run(frames=range(0, steps + 1, 5))[:, 0:2].real / simulation.world.dx - 0.5
+    low = run.min(axis=(0, 2)).astype(int) - 2
+    high = run.max(axis=(0, 2)).astype(int) + 5
+    return low, high - low
+
+
+def clamped(world: World) -> tuple[list[int], list[int]]:
+    """First and last node along x and y that no wall clamps; only sticking walls are known."""
+    if world.mirror_axis >= 0 or not np.all(np.isinf(world.wall_friction)):
+        raise NotImplementedError("only sticking walls and no mirror planes")
+    low, high = [0, 0], [world.nodes_x, world.nodes_y]
+    for axis, side, node in zip(world.wall_axis, world.wall_side, world.wall_node, strict=True):
+        if side > 0:
+            low[axis] = max(low[axis], int(node))
+        else:
+            high[axis] = min(high[axis], int(node))
+    return low, high
+
+
+def constants(simulation: Simulation) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+    """Volume, mass, lambda and mu (N,) of the particles."""
+    body, count = simulation.body, simulation.initial.shape[1]
+    arrays = (body.volume, body.mass, body.lame_lambda, body.lame_mu)
+    volume, mass, lame_lambda, lame_mu = (ungrouped(array, 1, count)[0] for array in arrays)
+    return volume, mass, lame_lambda, lame_mu

@@ -12,22 +12,13 @@ import numpy as np
 from jax import lax
 from numpy.typing import NDArray
 
-from mpmopt import mpm
 from mpmopt.objective import Objective
 from mpmopt.simulate import Simulation
+from peers import clamped, constants, window
 
 jax.config.update("jax_enable_x64", True)
 
 NAME = f"JAX {jax.__version__} jit, checkpointed scan"
-
-
-def window(simulation: Simulation) -> tuple[NDArray, NDArray]:
-    """First node and size of a window of nodes that the body never leaves."""
-    steps = simulation.steps
-    run = simulation.run(frames=range(0, steps + 1, 5))[:, 0:2].real / simulation.world.dx - 0.5
-    low = run.min(axis=(0, 2)).astype(int) - 2
-    high = run.max(axis=(0, 2)).astype(int) + 5
-    return low, high - low
 
 
 def kept(values):
@@ -73,22 +64,12 @@ def prepare(simulation: Simulation, objective: Objective) -> Peer:
     dt, dx = world.dt, world.dx
     inv, scale = 1 / dx, 4 / dx**2
     gravity = dt * np.array([world.gravity_x, world.gravity_y])
-    if world.mirror_axis >= 0 or not np.all(np.isinf(world.wall_friction)):
-        raise NotImplementedError("only sticking walls and no mirror planes")
-    lo, hi = [0, 0], [world.nodes_x, world.nodes_y]
-    for axis, side, node in zip(world.wall_axis, world.wall_side, world.wall_node):
-        if side > 0:
-            lo[axis] = max(lo[axis], int(node))
-        else:
-            hi[axis] = min(hi[axis], int(node))
+    lo, hi = clamped(world)
     ii, jj = np.meshgrid(np.arange(i0, i0 + ni), np.arange(j0, j0 + nj), indexing="ij")
     below = np.stack([ii < lo[0], jj < lo[1]], -1).reshape(M, 2)
     above = np.stack([ii > hi[0], jj > hi[1]], -1).reshape(M, 2)
+    volume, masses, lambdas, mus = constants(simulation)
 
-    def ungroup(records):
-        return mpm.ungrouped(records, 1, N)[0]
-
-    volume = ungroup(body.volume)
     impulse = dt * scale * volume
     actuator = simulation.particles.actuator
     onehot = (actuator == np.arange(K)[:, None]).astype(float)
@@ -225,9 +206,9 @@ def prepare(simulation: Simulation, objective: Objective) -> Peer:
     args = tuple(
         jnp.array(a)
         for a in (
-            ungroup(body.mass),
-            ungroup(body.lame_lambda),
-            ungroup(body.lame_mu),
+            masses,
+            lambdas,
+            mus,
             simulation.signal,
         )
     )

@@ -11,9 +11,9 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from mpmopt import mpm
 from mpmopt.objective import Objective
 from mpmopt.simulate import Simulation
+from peers import clamped, constants, window
 
 NAME = f"Taichi {'.'.join(map(str, ti.__version__))} autodiff"
 
@@ -28,15 +28,6 @@ class Peer:
     value_and_gradient: Callable[[], tuple[float, dict[str, NDArray[np.float64]]]]
 
 
-def window(simulation: Simulation) -> tuple[NDArray, NDArray]:
-    """First node and size of a window of nodes that the body never leaves."""
-    steps = simulation.steps
-    run = simulation.run(frames=range(0, steps + 1, 5))[:, 0:2].real / simulation.world.dx - 0.5
-    low = run.min(axis=(0, 2)).astype(int) - 2
-    high = run.max(axis=(0, 2)).astype(int) + 5
-    return low, high - low
-
-
 def prepare(simulation: Simulation, objective: Objective) -> Peer:
     """The scene of a simulation, ready to run in Taichi."""
     ti.init(arch=ti.cpu, default_fp=real, cpu_max_num_threads=2, offline_cache=False)
@@ -49,14 +40,7 @@ def prepare(simulation: Simulation, objective: Objective) -> Peer:
     dt, dx = world.dt, world.dx
     inv, scale = 1 / dx, 4 / dx**2
     gravity = ti.Vector([dt * world.gravity_x, dt * world.gravity_y])
-    if world.mirror_axis >= 0 or not np.all(np.isinf(world.wall_friction)):
-        raise NotImplementedError("only sticking walls and no mirror planes")
-    lo, hi = [0, 0], [world.nodes_x, world.nodes_y]
-    for axis, side, node in zip(world.wall_axis, world.wall_side, world.wall_node):
-        if side > 0:
-            lo[axis] = max(lo[axis], int(node))
-        else:
-            hi[axis] = min(hi[axis], int(node))
+    lo, hi = clamped(world)
     lox, loy = lo
     hix, hiy = hi
 
@@ -182,13 +166,12 @@ def prepare(simulation: Simulation, objective: Objective) -> Peer:
     def ratio():
         result[None] = sums[0] / sums[1]
 
-    def ungroup(records):
-        return mpm.ungrouped(records, 1, N)[0]
+    volumes, masses, lambdas, mus = constants(simulation)
 
-    mass.from_numpy(ungroup(body.mass))
-    lam.from_numpy(ungroup(body.lame_lambda))
-    mu.from_numpy(ungroup(body.lame_mu))
-    volume.from_numpy(ungroup(body.volume))
+    mass.from_numpy(masses)
+    lam.from_numpy(lambdas)
+    mu.from_numpy(mus)
+    volume.from_numpy(volumes)
     actuator.from_numpy(simulation.particles.actuator.astype(np.int32))
     weight.from_numpy(objective.weight)
     signal.from_numpy(simulation.signal)

@@ -11,9 +11,9 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from mpmopt import mpm
 from mpmopt.objective import Objective
 from mpmopt.simulate import Simulation
+from peers import clamped, constants, window
 
 NAME = f"Warp {wp.__version__} tape"
 
@@ -337,42 +337,25 @@ class Peer:
         return value, {**bars, "density": self.volume * bars["density"]}
 
 
-def window(simulation: Simulation) -> tuple[NDArray, NDArray]:
-    """First node and size of a window of nodes that the body never leaves."""
-    steps = simulation.steps
-    run = simulation.run(frames=range(0, steps + 1, 5))[:, 0:2].real / simulation.world.dx - 0.5
-    low = run.min(axis=(0, 2)).astype(int) - 2
-    high = run.max(axis=(0, 2)).astype(int) + 5
-    return low, high - low
-
-
 def prepare(simulation: Simulation, objective: Objective) -> Peer:
     """The scene of a simulation, ready to run in Warp."""
     world, body, steps = simulation.world, simulation.body, simulation.steps
-    if world.mirror_axis >= 0 or not np.all(np.isinf(world.wall_friction)):
-        raise NotImplementedError("only sticking walls and no mirror planes")
     N = simulation.initial.shape[1]
     wp.set_device("cpu")
 
     def array(values, dtype, grad=False):
         return wp.array(np.ascontiguousarray(values), dtype=dtype, requires_grad=grad)
 
-    def ungroup(records):
-        return mpm.ungrouped(records, 1, N)[0]
+    volumes, masses, lambdas, mus = constants(simulation)
 
-    volume = array(ungroup(body.volume), real)
-    mass = array(ungroup(body.mass), real, True)
-    lam = array(ungroup(body.lame_lambda), real, True)
-    mu = array(ungroup(body.lame_mu), real, True)
+    volume = array(volumes, real)
+    mass = array(masses, real, True)
+    lam = array(lambdas, real, True)
+    mu = array(mus, real, True)
     signal = array(simulation.signal, real, True)
     actuator = array(simulation.particles.actuator, int)
     stress = array(body.actuation_stress[:, [0, 1, 1, 2]].reshape(-1, 2, 2), mat22)
-    lo, hi = [0, 0], [world.nodes_x, world.nodes_y]
-    for axis, side, node in zip(world.wall_axis, world.wall_side, world.wall_node):
-        if side > 0:
-            lo[axis] = max(lo[axis], int(node))
-        else:
-            hi[axis] = min(hi[axis], int(node))
+    lo, hi = clamped(world)
     low, size = window(simulation)
     nodes = int(size[0] * size[1])
     setup = Setup()
@@ -447,4 +430,4 @@ def prepare(simulation: Simulation, objective: Objective) -> Peer:
             bar.zero_()
         tape.backward(result)
     kept = [*material, *x, *F, *grid, *u, xs, Fs, grids, us, v0, C0, weight, sums]
-    return Peer(result, forward.graph, backward.graph, ungroup(body.volume), bars, kept)
+    return Peer(result, forward.graph, backward.graph, volumes, bars, kept)
