@@ -9,16 +9,24 @@ A step advances the particle states from t_n to t_n + dt (primes mark the new st
     mirror       adds the images across a plane of symmetry, if the scene has one
     grid_update  u_i = wall(q_i / m_i + dt g)
     g2p          v'  = sum_i w_ip u_i,  C' = c sum_i w_ip u_i (x_i - x)^T,  x' = x + dt v'
+    blend        v' += keep (v - sum_i w_ip u_i_old), if the scene asks for it
 
 Every kernel is followed by its adjoint of the same name, which uses the same variable names;
 ``_bar`` marks the derivative of the objective with respect to a variable. Branches (contact, cells)
 are those that the forward step took.
 
-Arrays hold records of four numbers, which a processor handles as one. Particles come in groups of
-four: records 12 g to 12 g + 11 of a state are x, y, u, v, C00, C01, C10, C11, F00, F01, F10, F11 of
-group g, and `grouped` makes them of an array (12, N). Grid arrays hold the window of nodes that
-the particles touch and no others: node (i, j) is record ``(i - i0) nj + (j - j0)`` of window
-``(i0, j0, ni, nj)``.
+Sums over the nine nodes of a particle are not taken node by node. Where a particle is t cells from
+the middle of its three nodes along an axis, |t| <= 1/2, the weights of all three are quadratic in
+t: w = b_0 + t b_1 + (t^2/2) b_2 with constants b_k (`expand`). So a field on the nodes is a
+polynomial in each cell, its Taylor expansion about the middle node, and what particles put on nodes
+passes through moments of the cell, the transpose. A cell is expanded once for all particles in it.
+
+Arrays (M, 4) hold records of four numbers and flat arrays (2 M,) pairs, which a processor handles
+as one. Particles come in groups of four: records 12 g to 12 g + 11 of a state are x, y, u, v, C00,
+C01, C10, C11, F00, F01, F10, F11 of group g, and `grouped` makes them of an array (12, N). Grid
+arrays hold the window of nodes that the particles touch and no others: node (i, j) is record
+``(i - i0) nj + (j - j0)`` of window ``(i0, j0, ni, nj)``. Records 9 c to 9 c + 8 of cell arrays are
+the coefficients of cell c, number 3 k + l that of order k along x and l along y.
 
 Several threads share a step. Each has its blocks of groups, which put their momentum on nodes of
 their own, and its columns of the window, in which it adds the blocks up in their order. So results
@@ -27,7 +35,7 @@ do not depend on the number of threads. What is derived of particles lives in a 
 The kernels also compile for complex128, which makes the complex step an oracle for the adjoint:
 cells, walls and comparisons look at real parts only. They know arrays and numbers, no user objects,
 and they live in one file because Numba's disk cache does not see changes in another one. What
-records can do (`load`, `store`, `spread`, `blend`, ...) stands at the end of the file.
+records can do (`load`, `store`, `pack`, ...) stands at the end of the file.
 
 Sources: Hu et al. 2018 (MLS-MPM), Jiang et al. 2015 (APIC), Sato et al. 2023 (actuation).
 """
@@ -82,6 +90,7 @@ class World(NamedTuple):
     wall_friction: NDArray[np.float64]  # (W,) Coulomb coefficient, infinite: sticks
     mirror_axis: int  # of the mirror plane's normal: 0 or 1; -1: no mirror
     mirror_node: int  # line of nodes that is the plane
+    keep: float  # share of what the grid smoothed away that particles keep; 0: no blend
 
 
 class Body(NamedTuple):
@@ -105,9 +114,9 @@ class BodyBar(NamedTuple):
     lame_mu: NDArray  # (G, 4)
 
     @classmethod
-    def zeros(cls, groups: int) -> "BodyBar":
+    def zeros(cls, groups: int, dtype: DTypeLike = float) -> "BodyBar":
         """Nothing accumulated yet."""
-        return cls(*(np.zeros((groups, 4)) for _ in cls._fields))
+        return cls(*(np.zeros((groups, 4), dtype) for _ in cls._fields))
 
 
 class Tile(NamedTuple):
@@ -116,42 +125,66 @@ class Tile(NamedTuple):
     Arrays of records, so many for each of T groups.
     """
 
-    base: NDArray[np.float64]  # (2 T, 4) first of the three nodes along x and y
-    spline: NDArray  # (24 T, 4) by threes: w and w r along x and y; r and s of x, of y
-    affine: NDArray  # (4 T, 4) A, the affine momentum
-    gathered: NDArray  # (8 T, 4) by `p2g_adjoint`: A_bar, sum of w q_bar, sum over grad(w)
-    mass_bar: NDArray  # (T, 4) sum over nodes of w m_bar
+    cell: NDArray[np.float64]  # (T, 4) number of a particle's cell in the block's window
+    place: NDArray  # (6 T, 4) by pairs along x and y: t, t^2/2, 3t/8 - t^3/2
+    affine: NDArray  # (4 T, 4) A dx, the affine momentum of a cell's width
+    gathered: NDArray  # (9 T, 4) by `p2g_adjoint`: A_bar, sums of w q_bar, w m_bar, slopes
 
 
 @jit
 def make_tile(groups, like):
     """Room for so many groups, of the type of the array `like`."""
-    zero = 0.0 * like.flat[0]
     return Tile(
-        np.zeros((2 * groups, 4)),
-        np.full((24 * groups, 4), zero),
-        np.full((4 * groups, 4), zero),
-        np.full((8 * groups, 4), zero),
-        np.full((groups, 4), zero),
+        np.zeros((groups, 4), like.real.dtype),
+        np.zeros((6 * groups, 4), like.dtype),
+        np.zeros((4 * groups, 4), like.dtype),
+        np.zeros((9 * groups, 4), like.dtype),
     )
 
 
 class Scratch(NamedTuple):
-    """What the threads share during a step, for B blocks and a window of M nodes."""
+    """What the threads share during a step, for B blocks and a window of M nodes.
 
-    velocity: NDArray  # (M, 4) u, of which two numbers are used
-    velocity_bar: NDArray  # (M, 4)
-    node_bar: NDArray  # (M, 4) adjoints of momentum and mass
-    parts: NDArray  # (B, P, 4) what each block puts on the nodes of its own window
+    There are S sheets of nodes: one, or two where a scene blends. Then the second has the momentum
+    before force, gravity and walls, and its velocity.
+    """
+
+    velocity: NDArray  # (S, 2 M) u
+    velocity_bar: NDArray  # (S, 2 M)
+    node_bar: NDArray  # (S, M, 4) adjoints of momentum and mass
+    parts: NDArray  # (B, S, P, 4) what each block puts on the nodes of its own window
+    parts_bar: NDArray  # (B, S, 2 P) the same of `velocity_bar`
     ends: NDArray[np.int64]  # (B, 2) how the step ended for each block, and a particle
 
     @classmethod
-    def make(cls, nodes: int, blocks: int, part: int, dtype: DTypeLike = float) -> "Scratch":
-        """Room for so many nodes, blocks, and nodes of a block."""
-        node, parts = (nodes, NODE_SIZE), (blocks, part, NODE_SIZE)
-        velocity, velocity_bar, node_bar = (np.zeros(node, dtype) for _ in range(3))
-        ends = np.zeros((blocks, 2), np.int64)
-        return cls(velocity, velocity_bar, node_bar, np.zeros(parts, dtype), ends)
+    def make(
+        cls, sheets: int, nodes: int, blocks: int, part: int, dtype: DTypeLike = float
+    ) -> "Scratch":
+        """Room for so many sheets, nodes, blocks, and nodes of a block."""
+        return cls(
+            np.zeros((sheets, 2 * nodes), dtype),
+            np.zeros((sheets, 2 * nodes), dtype),
+            np.zeros((sheets, nodes, NODE_SIZE), dtype),
+            np.zeros((blocks, sheets, part, NODE_SIZE), dtype),
+            np.zeros((blocks, sheets, 2 * part), dtype),
+            np.zeros((blocks, 2), np.int64),
+        )
+
+
+@jit
+def make_cells(scratch):
+    """Coefficients of the cells of any block, of records (S, 9 P, 4) and of pairs (S, 18 P)."""
+    _, sheets, part, _ = scratch.parts.shape
+    dtype = scratch.parts.dtype
+    return np.zeros((sheets, 9 * part, 4), dtype), np.zeros((sheets, 18 * part), dtype)
+
+
+@jit
+def clear(cells, part):
+    """Zero the coefficients of a window's cells."""
+    zero = nothing(cells)
+    for k in range(9 * part[2] * (part[3] - 2)):
+        store(cells, k, zero)
 
 
 @jit
@@ -161,15 +194,156 @@ def weights(f):
 
 
 @jit
-def weight_slopes(f, dx):
-    """Derivatives of the three weights with respect to the position."""
-    return (f - 1.5) / dx, (2.0 - 2.0 * f) / dx, (f - 0.5) / dx
+def expand(f0, f1, f2):
+    """Value, slope and curvature, per cell, of the spline of three nodes, at the middle."""
+    outer = f0 + f2
+    return 0.125 * outer + 0.75 * f1, 0.5 * (f2 - f0), outer - 2.0 * f1
 
 
 @jit
-def distances(f, dx):
-    """From the particle to the three nodes."""
-    return (0.0 - f) * dx, (1.0 - f) * dx, (2.0 - f) * dx
+def expand_adjoint(c0, c1, c2):
+    """What three nodes get of the moments of order 0, 1 and 2: the transpose of `expand`."""
+    even, odd = 0.125 * c0 + c2, 0.5 * c1
+    return even - odd, 0.75 * c0 - 2.0 * c2, even + odd
+
+
+@jit
+def taylor(nodes, window, part, cells):
+    """Taylor coefficients of a field on the nodes of a window, for all cells of a part of it."""
+    i0, j0, _, nj = window
+    i1, j1, columns, rows = part[0], part[1], part[2], part[3] - 2
+    for i in range(columns):  # along y
+        node = (i1 - i0 + i) * nj + j1 - j0
+        for j in range(rows):
+            c = 9 * (i * rows + j)
+            v, s, k = expand(
+                load(nodes, node + j), load(nodes, node + j + 1), load(nodes, node + j + 2)
+            )
+            store(cells, c, v)
+            store(cells, c + 1, s)
+            store(cells, c + 2, k)
+    stride = 9 * rows
+    for i in range(columns - 2):  # along x
+        for c in range(i * stride, (i + 1) * stride, 9):
+            for order in range(c, c + 3):
+                v, s, k = expand(
+                    load(cells, order), load(cells, order + stride), load(cells, order + 2 * stride)
+                )
+                store(cells, order, v)
+                store(cells, order + 3, s)
+                store(cells, order + 6, k)
+
+
+@jit
+def taylor_adjoint(cells, part, nodes):
+    """From moments of all cells of a part to its nodes: the transpose of `taylor`."""
+    columns, rows = part[2], part[3] - 2
+    stride = 9 * rows
+    for i in range(columns - 3, -1, -1):  # along x
+        for c in range(i * stride, (i + 1) * stride, 9):
+            for order in range(c, c + 3):
+                f0, f1, f2 = expand_adjoint(
+                    load(cells, order), load(cells, order + 3), load(cells, order + 6)
+                )
+                store(cells, order, f0)
+                add(cells, order + stride, f1)
+                add(cells, order + 2 * stride, f2)
+    for i in range(columns):  # along y
+        node = i * part[3]
+        here = after = nothing(cells)
+        for j in range(rows):
+            c = 9 * (i * rows + j)
+            f0, f1, f2 = expand_adjoint(load(cells, c), load(cells, c + 1), load(cells, c + 2))
+            store(nodes, node + j, here + f0)
+            here, after = after + f1, f2
+        store(nodes, node + rows, here)
+        store(nodes, node + rows + 1, after)
+
+
+@jit
+def deposit(cells, tile, g, k, f, a, b):
+    """Add the moments of w f + w r_x a + w r_y b to the cell of particle k of a group."""
+    c = 9 * int(number(tile.cell, g, k))
+    tx, hx, rx = (
+        number(tile.place, 6 * g, k),
+        number(tile.place, 6 * g + 2, k),
+        number(tile.place, 6 * g + 4, k),
+    )
+    deposit_row(cells, c, tile, g, k, f, b)
+    deposit_row(cells, c + 3, tile, g, k, tx * f + 0.25 * a, tx * b)
+    deposit_row(cells, c + 6, tile, g, k, hx * f + rx * a, hx * b)
+
+
+@jit
+def deposit_row(cells, c, tile, g, k, f, b):
+    """The moments along y of w f + w r_y b."""
+    ty, hy, ry = (
+        number(tile.place, 6 * g + 1, k),
+        number(tile.place, 6 * g + 3, k),
+        number(tile.place, 6 * g + 5, k),
+    )
+    add(cells, c, f)
+    add(cells, c + 1, ty * f + 0.25 * b)
+    add(cells, c + 2, hy * f + ry * b)
+
+
+@jit
+def moments(cells, tile, g, k):
+    """Sums over the nodes of particle k of a group of w f, w r_x f and w r_y f, for r in cells."""
+    c = 9 * int(number(tile.cell, g, k))
+    tx, hx, rx = (
+        number(tile.place, 6 * g, k),
+        number(tile.place, 6 * g + 2, k),
+        number(tile.place, 6 * g + 4, k),
+    )
+    f0, b0 = moments_row(cells, c, tile, g, k)
+    f1, b1 = moments_row(cells, c + 3, tile, g, k)
+    f2, b2 = moments_row(cells, c + 6, tile, g, k)
+    return f0 + tx * f1 + hx * f2, 0.25 * f1 + rx * f2, b0 + tx * b1 + hx * b2
+
+
+@jit
+def moments_row(cells, c, tile, g, k):
+    """Along y only: w f and w r_y f."""
+    ty, hy, ry = (
+        number(tile.place, 6 * g + 1, k),
+        number(tile.place, 6 * g + 3, k),
+        number(tile.place, 6 * g + 5, k),
+    )
+    f0, f1, f2 = load(cells, c), load(cells, c + 1), load(cells, c + 2)
+    return f0 + ty * f1 + hy * f2, 0.25 * f1 + ry * f2
+
+
+@jit
+def slopes(cells, tile, g, k, f, a, b):
+    """Derivatives along x and y, per cell, of f.sum(w F) + a.sum(w r_x F) + b.sum(w r_y F).
+
+    F is the cells' field. As records: the derivative is the sum of their numbers.
+    """
+    c = 9 * int(number(tile.cell, g, k))
+    tx, hx, rx = (
+        number(tile.place, 6 * g, k),
+        number(tile.place, 6 * g + 2, k),
+        number(tile.place, 6 * g + 4, k),
+    )
+    _, _, s0, _ = slopes_row(cells, c, tile, g, k)
+    f1, b1, s1, k1 = slopes_row(cells, c + 3, tile, g, k)
+    f2, b2, s2, k2 = slopes_row(cells, c + 6, tile, g, k)
+    k0 = load(cells, c + 2)
+    hy = number(tile.place, 6 * g + 3, k)
+    along_x = (f1 + tx * f2) * f + ((0.375 - 3.0 * hx) * f2) * a + (b1 + tx * b2) * b
+    bent = (0.375 - 3.0 * hy) * (k0 + tx * k1 + hx * k2)
+    along_y = (s0 + tx * s1 + hx * s2) * f + (0.25 * s1 + rx * s2) * a + bent * b
+    return along_x, along_y
+
+
+@jit
+def slopes_row(cells, c, tile, g, k):
+    """Along y only: w f, w r_y f, and of the former slope and curvature."""
+    ty = number(tile.place, 6 * g + 1, k)
+    f, b = moments_row(cells, c, tile, g, k)
+    curvature = load(cells, c + 2)
+    return f, b, load(cells, c + 1) + ty * curvature, curvature
 
 
 @jit
@@ -190,16 +364,15 @@ def interpolation(position, dx, rows):
 @jit
 def find_window(state, world, first, last):
     """Window (i0, j0, ni, nj) of the nodes that particles touch; whether all are on the grid."""
-    dx = world.dx
-    lo = spread(0.5 * dx)
-    hi_x, hi_y = spread((world.nodes_x - 1.5) * dx), spread((world.nodes_y - 1.5) * dx)
-    i_min, j_min = spread(float(world.nodes_x)), spread(float(world.nodes_y))
-    i_max = j_max = spread(0.0)
+    dx, per_dx = world.dx, 1.0 / world.dx
+    lo, hi_x, hi_y = 0.5 * dx, (world.nodes_x - 1.5) * dx, (world.nodes_y - 1.5) * dx
+    i_max = j_max = real(nothing(state))
+    i_min, j_min = i_max + world.nodes_x, j_max + world.nodes_y
     for g in range(first, last):
         x, y = real(load(state, 12 * g)), real(load(state, 12 * g + 1))
         if not (within(x, lo, hi_x) and within(y, lo, hi_y)):
             return 0, 0, 0, 0, False
-        i, j = whole(x / dx - 0.5), whole(y / dx - 0.5)  # as in `locate`
+        i, j = whole(per_dx * x - 0.5), whole(per_dx * y - 0.5)  # as in `locate`
         i_min, i_max = least(i_min, i), greatest(i_max, i)
         j_min, j_max = least(j_min, j), greatest(j_max, j)
     i0, i1, j0, j1 = i_min[0], i_max[0], j_min[0], j_max[0]
@@ -209,39 +382,23 @@ def find_window(state, world, first, last):
 
 
 @jit
-def locate(state, world, tile, first, last):
-    """Base nodes of the particles, and their weights w and w r along x and y, into the tile."""
-    dx = world.dx
+def locate(state, world, part, tile, first, last):
+    """The cells of the particles in the window `part` and their places in them, into the tile."""
+    i0, j0, _, nj = part
+    per_dx = 1.0 / world.dx
     for g in range(first, last):
-        t = g - first
-        x, y = load(state, 12 * g) / dx, load(state, 12 * g + 1) / dx
+        k = g - first
+        x, y = per_dx * load(state, 12 * g), per_dx * load(state, 12 * g + 1)
         i, j = whole(real(x) - 0.5), whole(real(y) - 0.5)
-        store(tile.base, 2 * t, i)
-        store(tile.base, 2 * t + 1, j)
-        w_x, r_x = weights(x - i), distances(x - i, dx)
-        w_y, r_y = weights(y - j), distances(y - j, dx)
-        for a in range(3):
-            store(tile.spline, 24 * t + a, w_x[a])
-            store(tile.spline, 24 * t + 3 + a, w_x[a] * r_x[a])
-            store(tile.spline, 24 * t + 6 + a, w_y[a])
-            store(tile.spline, 24 * t + 9 + a, w_y[a] * r_y[a])
-
-
-@jit
-def locate_adjoint(state, world, tile, first, last):
-    """After `locate`: distances r and the weights' slopes s along x and y, into the tile."""
-    dx = world.dx
-    for g in range(first, last):
-        t = g - first
-        fx = load(state, 12 * g) / dx - load(tile.base, 2 * t)
-        fy = load(state, 12 * g + 1) / dx - load(tile.base, 2 * t + 1)
-        s_x, r_x = weight_slopes(fx, dx), distances(fx, dx)
-        s_y, r_y = weight_slopes(fy, dx), distances(fy, dx)
-        for a in range(3):
-            store(tile.spline, 24 * t + 12 + a, r_x[a])
-            store(tile.spline, 24 * t + 15 + a, s_x[a])
-            store(tile.spline, 24 * t + 18 + a, r_y[a])
-            store(tile.spline, 24 * t + 21 + a, s_y[a])
+        store(tile.cell, k, (nj - 2) * (i - i0) + (j - j0))
+        tx, ty = x - (i + 1.0), y - (j + 1.0)
+        hx, hy = 0.5 * tx * tx, 0.5 * ty * ty
+        store(tile.place, 6 * k, tx)
+        store(tile.place, 6 * k + 1, ty)
+        store(tile.place, 6 * k + 2, hx)
+        store(tile.place, 6 * k + 3, hy)
+        store(tile.place, 6 * k + 4, tx * (0.375 - hx))
+        store(tile.place, 6 * k + 5, ty * (0.375 - hy))
 
 
 @jit
@@ -308,7 +465,7 @@ def deform_adjoint(old, world, bar, first, last):
 
 @jit
 def stress(old, new, log_J, body, world, signal, tile, first, last):
-    """Affine momentum A from C, F' and ln J'."""
+    """Affine momentum A dx from C, F' and ln J'."""
     for g in range(first, last):
         c00, c01, c10, c11 = tensor(old, 12 * g + 4)
         f00, f01, f10, f11 = tensor(new, 12 * g + 8)
@@ -322,7 +479,8 @@ def stress(old, new, log_J, body, world, signal, tile, first, last):
             t00 = t00 + f00 * (s00 * f00 + s01 * f01) + f01 * (s01 * f00 + s11 * f01)
             t01 = t01 + f00 * (s00 * f10 + s01 * f11) + f01 * (s01 * f10 + s11 * f11)
             t11 = t11 + f10 * (s00 * f10 + s01 * f11) + f11 * (s01 * f10 + s11 * f11)
-        impulse = world.dt * (4.0 / world.dx**2) * load(body.volume, g)
+        impulse = (4.0 * world.dt / world.dx) * load(body.volume, g)
+        m = world.dx * m
         store_tensor(
             tile.affine,
             4 * (g - first),
@@ -336,7 +494,7 @@ def stress(old, new, log_J, body, world, signal, tile, first, last):
 @jit
 def actuation(body, g, signal):
     """s S of the actuators of four particles: xx, xy, yy."""
-    s00 = s01 = s11 = spread(0.0 * body.mass[g, 0])
+    s00 = s01 = s11 = 0.0 * load(body.mass, g)
     for k in range(signal.size):
         there = load(body.actuated[k], g)
         s00 = s00 + signal[k] * body.actuation_stress[k, 0] * there
@@ -349,13 +507,16 @@ def actuation(body, g, signal):
 def stress_adjoint(
     old, new, log_J, body, world, signal, tile, bar, body_bar, signal_bar, first, last
 ):
-    """From A_bar to C_bar; adds to F_bar' and to the adjoints of the material and the signal."""
+    """From A_bar: adds to C_bar, F_bar' and to the adjoints of the material and the signal."""
     for g in range(first, last):
         c00, c01, c10, c11 = tensor(old, 12 * g + 4)
         f00, f01, f10, f11 = tensor(new, 12 * g + 8)
-        a00, a01, a10, a11 = tensor(tile.gathered, 8 * (g - first))
+        a00, a01, a10, a11 = tensor(tile.gathered, 9 * (g - first))
         m, mu = load(body.mass, g), load(body.lame_mu, g)
-        store_tensor(bar, 12 * g + 4, m * a00, m * a01, m * a10, m * a11)
+        add(bar, 12 * g + 4, m * a00)
+        add(bar, 12 * g + 5, m * a01)
+        add(bar, 12 * g + 6, m * a10)
+        add(bar, 12 * g + 7, m * a11)
         add(body_bar.mass, g, a00 * c00 + a01 * c01 + a10 * c10 + a11 * c11)
 
         # T = tau_bar; tau is symmetric, and t01 gathers both of its places in A.
@@ -398,116 +559,76 @@ def stress_adjoint(
 
 
 @jit
-def spreads(tile, row, k):
-    """Three numbers of particle k of four as records: from a record of the tile's splines on."""
-    w0, w1 = number(tile.spline, row, k), number(tile.spline, row + 1, k)
-    return spread(w0), spread(w1), spread(number(tile.spline, row + 2, k))
+def inertia(old, body, world, tile, first, last):
+    """Affine momentum A dx of the velocity alone, m C dx, in the place of `stress`."""
+    for g in range(first, last):
+        m = world.dx * load(body.mass, g)
+        c00, c01, c10, c11 = tensor(old, 12 * g + 4)
+        store_tensor(tile.affine, 4 * (g - first), m * c00, m * c01, m * c10, m * c11)
 
 
 @jit
-def blends(x, y):
-    """First halves of three records and second halves of three others."""
-    return blend(x[0], y[0]), blend(x[1], y[1]), blend(x[2], y[2])
+def inertia_adjoint(old, body, tile, bar, body_bar, first, last):
+    """Adds to C_bar and to the adjoint of the mass."""
+    for g in range(first, last):
+        c00, c01, c10, c11 = tensor(old, 12 * g + 4)
+        a00, a01, a10, a11 = tensor(tile.gathered, 9 * (g - first))
+        m = load(body.mass, g)
+        add(body_bar.mass, g, a00 * c00 + a01 * c01 + a10 * c10 + a11 * c11)
+        add(bar, 12 * g + 4, m * a00)
+        add(bar, 12 * g + 5, m * a01)
+        add(bar, 12 * g + 6, m * a10)
+        add(bar, 12 * g + 7, m * a11)
 
 
 @jit
-def p2g(state, body, world, tile, window, grid, first, last):
-    """Particle to grid: momentum and mass (q_x, q_y, m, 0) of the window's nodes."""
-    i0, j0, _, nj = window
+def p2g(state, body, tile, cells, first, last):
+    """Particle to grid: momentum and mass (q_x, q_y, m, 0), as moments of cells."""
     for g in range(first, last):
         t = g - first
         for k in range(4):
-            i, j = number(tile.base, 2 * t, k), number(tile.base, 2 * t + 1, k)
-            node = (int(i) - i0) * nj + int(j) - j0
-            w_x, wr_x = spreads(tile, 24 * t, k), spreads(tile, 24 * t + 3, k)
-            w_y, wr_y = spreads(tile, 24 * t + 6, k), spreads(tile, 24 * t + 9, k)
             m = number(body.mass, g, k)
             zero = 0.0 * m
             A, row = tile.affine, 4 * t
             q = pack(m * number(state, 12 * g + 2, k), m * number(state, 12 * g + 3, k), m, zero)
             a0 = pack(number(A, row, k), number(A, row + 2, k), zero, zero)
             a1 = pack(number(A, row + 1, k), number(A, row + 3, k), zero, zero)
-            p2g_row(grid, node, w_x[0] * q + wr_x[0] * a0, w_x[0] * a1, w_y, wr_y)
-            p2g_row(grid, node + nj, w_x[1] * q + wr_x[1] * a0, w_x[1] * a1, w_y, wr_y)
-            p2g_row(grid, node + 2 * nj, w_x[2] * q + wr_x[2] * a0, w_x[2] * a1, w_y, wr_y)
+            deposit(cells, tile, t, k, q, a0, a1)
 
 
 @jit
-def p2g_row(grid, n, q, a1, w, wr):
-    """Add w q + w r a1 to three nodes in a row."""
-    add(grid, n, w[0] * q + wr[0] * a1)
-    add(grid, n + 1, w[1] * q + wr[1] * a1)
-    add(grid, n + 2, w[2] * q + wr[2] * a1)
-
-
-@jit
-def p2g_adjoint(state, body, world, tile, scratch, window, bar, body_bar, first, last):
-    """From momentum_bar and mass_bar of nodes to v_bar, A_bar, x_bar and mass_bar of particles."""
-    i0, j0, _, nj = window
-    nodes, A, gathered = scratch.node_bar, tile.affine, tile.gathered
+def p2g_adjoint(state, body, world, tile, cells, bar, body_bar, first, last):
+    """From momentum_bar and mass_bar of cells to A_bar; adds to x_bar, v_bar and mass_bar."""
+    dx, per_dx, gathered = world.dx, 1.0 / world.dx, tile.gathered
     for g in range(first, last):
         t = g - first
         for k in range(4):
-            i, j = number(tile.base, 2 * t, k), number(tile.base, 2 * t + 1, k)
-            node = (int(i) - i0) * nj + int(j) - j0
-            w_x, wr_x = spreads(tile, 24 * t, k), spreads(tile, 24 * t + 3, k)
-            w_y, wr_y = spreads(tile, 24 * t + 6, k), spreads(tile, 24 * t + 9, k)
-            r_x, s_x = spreads(tile, 24 * t + 12, k), spreads(tile, 24 * t + 15, k)
-            r_y, s_y = spreads(tile, 24 * t + 18, k), spreads(tile, 24 * t + 21, k)
-            w_wr, w_s, s_w = blends(w_y, wr_y), blends(w_y, s_y), blends(s_x, w_x)
             m = number(body.mass, g, k)
-            q = pair(m * number(state, 12 * g + 2, k), m * number(state, 12 * g + 3, k))
-            a0 = pair(number(A, 4 * t, k), number(A, 4 * t + 2, k))
-            a1 = pair(number(A, 4 * t + 1, k), number(A, 4 * t + 3, k))
-            mean_0, slope_0, mass_0 = p2g_adjoint_row(
-                nodes, node, q + r_x[0] * a0, a1, r_y, w_wr, w_s
-            )
-            mean_1, slope_1, mass_1 = p2g_adjoint_row(
-                nodes, node + nj, q + r_x[1] * a0, a1, r_y, w_wr, w_s
-            )
-            mean_2, slope_2, mass_2 = p2g_adjoint_row(
-                nodes, node + 2 * nj, q + r_x[2] * a0, a1, r_y, w_wr, w_s
-            )
-            mean = w_x[0] * mean_0 + w_x[1] * mean_1 + w_x[2] * mean_2
-            along = wr_x[0] * mean_0 + wr_x[1] * mean_1 + wr_x[2] * mean_2
-            slope = s_w[0] * slope_0 + s_w[1] * slope_1 + s_w[2] * slope_2
-            # Lanes of w_s m_bar: (w, w, s, s), and along x: (s, w, w, w).
-            mass = blend(alternate(s_x[0], w_x[0]), w_x[0]) * mass_0
-            mass = mass + blend(alternate(s_x[1], w_x[1]), w_x[1]) * mass_1
-            mass = mass + blend(alternate(s_x[2], w_x[2]), w_x[2]) * mass_2
-            set_number(gathered, 8 * t, k, along[0])
-            set_number(gathered, 8 * t + 1, k, mean[2])
-            set_number(gathered, 8 * t + 2, k, along[1])
-            set_number(gathered, 8 * t + 3, k, mean[3])
-            set_number(gathered, 8 * t + 4, k, mean[0])
-            set_number(gathered, 8 * t + 5, k, mean[1])
-            set_number(gathered, 8 * t + 6, k, slope[0] + slope[1] + m * mass[0])
-            set_number(gathered, 8 * t + 7, k, slope[2] + slope[3] + m * mass[2])
-            set_number(tile.mass_bar, t, k, mass[1])
-        a00, a01, a10, a11 = tensor(A, 4 * t)
-        qx_bar, qy_bar = load(gathered, 8 * t + 4), load(gathered, 8 * t + 5)
-        add(bar, 12 * g, load(gathered, 8 * t + 6) - a00 * qx_bar - a10 * qy_bar)
-        add(bar, 12 * g + 1, load(gathered, 8 * t + 7) - a01 * qx_bar - a11 * qy_bar)
+            zero = 0.0 * m
+            A, row = tile.affine, 4 * t
+            q = pack(m * number(state, 12 * g + 2, k), m * number(state, 12 * g + 3, k), m, zero)
+            a0 = pack(number(A, row, k), number(A, row + 2, k), zero, zero)
+            a1 = pack(number(A, row + 1, k), number(A, row + 3, k), zero, zero)
+            mean, along_x, along_y = moments(cells, tile, t, k)
+            slope_x, slope_y = slopes(cells, tile, t, k, q, a0, a1)
+            set_number(gathered, 9 * t, k, along_x[0])
+            set_number(gathered, 9 * t + 1, k, along_y[0])
+            set_number(gathered, 9 * t + 2, k, along_x[1])
+            set_number(gathered, 9 * t + 3, k, along_y[1])
+            set_number(gathered, 9 * t + 4, k, mean[0])
+            set_number(gathered, 9 * t + 5, k, mean[1])
+            set_number(gathered, 9 * t + 6, k, mean[2])
+            set_number(gathered, 9 * t + 7, k, total(slope_x))
+            set_number(gathered, 9 * t + 8, k, total(slope_y))
+        a00, a01, a10, a11 = tensor(gathered, 9 * t)
+        store_tensor(gathered, 9 * t, dx * a00, dx * a01, dx * a10, dx * a11)
+        add(bar, 12 * g, per_dx * load(gathered, 9 * t + 7))
+        add(bar, 12 * g + 1, per_dx * load(gathered, 9 * t + 8))
         m, u, v = load(body.mass, g), load(state, 12 * g + 2), load(state, 12 * g + 3)
-        store(bar, 12 * g + 2, m * qx_bar)
-        store(bar, 12 * g + 3, m * qy_bar)
-        add(body_bar.mass, g, load(tile.mass_bar, t) + u * qx_bar + v * qy_bar)
-
-
-@jit
-def p2g_adjoint_row(nodes, n, q, a1, r, w_wr, w_s):
-    """Sums over three nodes in a row: w q_bar and w r q_bar; w, s times q_bar.(q + a1 r); m_bar."""
-    q_bar, m_bar = load_pair(nodes, n), spread(number(nodes, n, 2))
-    mean, slope, mass = w_wr[0] * q_bar, w_s[0] * ((q + r[0] * a1) * q_bar), w_s[0] * m_bar
-    q_bar, m_bar = load_pair(nodes, n + 1), spread(number(nodes, n + 1, 2))
-    mean = mean + w_wr[1] * q_bar
-    slope = slope + w_s[1] * ((q + r[1] * a1) * q_bar)
-    mass = mass + w_s[1] * m_bar
-    q_bar, m_bar = load_pair(nodes, n + 2), spread(number(nodes, n + 2, 2))
-    mean = mean + w_wr[2] * q_bar
-    slope = slope + w_s[2] * ((q + r[2] * a1) * q_bar)
-    mass = mass + w_s[2] * m_bar
-    return mean, slope, mass
+        u_bar, v_bar = load(gathered, 9 * t + 4), load(gathered, 9 * t + 5)
+        add(bar, 12 * g + 2, m * u_bar)
+        add(bar, 12 * g + 3, m * v_bar)
+        add(body_bar.mass, g, load(gathered, 9 * t + 6) + u * u_bar + v * v_bar)
 
 
 @jit
@@ -587,152 +708,156 @@ def wall_adjoint(i, j, u, v, world, u_bar, v_bar):
 
 
 @jit
-def add_blocks(parts, windows, window, a, nodes):
+def add_blocks(parts, sheet, windows, window, a, nodes):
     """Column a of the window: the sum of what the blocks put there, in their order."""
     i0, j0, _, nj = window
-    nodes[a * nj : (a + 1) * nj] = 0.0
+    for k in range(a * nj, (a + 1) * nj):
+        store(nodes, k, nothing(nodes))
     for b in range(parts.shape[0]):
         column = i0 + a - windows[b, 0]
         if 0 <= column < windows[b, 2]:
             source, target = column * windows[b, 3], a * nj + windows[b, 1] - j0
             for k in range(windows[b, 3]):
-                store(nodes, target + k, load(nodes, target + k) + load(parts[b], source + k))
+                add(nodes, target + k, load(parts[b, sheet], source + k))
 
 
 @jit
-def grid_update(grid, window, world, scratch, a):
+def grid_update(grid, window, world, velocity, a):
     """Velocity of column a's nodes from momentum, gravity and walls; zero where no mass is."""
     i0, j0, _, nj = window
     for b in range(nj):
         node = a * nj + b
-        m = grid[node, 2]
+        m = grid[0, node, 2]
         u = v = 0.0 * m
         if m.real > 0.0:
-            u = grid[node, 0] / m + world.dt * world.gravity_x
-            v = grid[node, 1] / m + world.dt * world.gravity_y
+            per_m = 1.0 / m
+            u = grid[0, node, 0] * per_m + world.dt * world.gravity_x
+            v = grid[0, node, 1] * per_m + world.dt * world.gravity_y
             u, v = wall(i0 + a, j0 + b, u, v, world)
-        scratch.velocity[node, 0], scratch.velocity[node, 1] = u, v
+        velocity[0, 2 * node], velocity[0, 2 * node + 1] = u, v
+        if world.keep > 0.0:
+            u = v = 0.0 * m
+            if m.real > 0.0:
+                per_m = 1.0 / grid[1, node, 2]
+                u, v = grid[1, node, 0] * per_m, grid[1, node, 1] * per_m
+            velocity[1, 2 * node], velocity[1, 2 * node + 1] = u, v
 
 
 @jit
-def grid_update_adjoint(grid, window, world, scratch, a):
+def grid_update_adjoint(grid, window, world, velocity_bar, node_bar, a):
     """From velocity_bar of column a's nodes to their momentum_bar and mass_bar."""
     i0, j0, _, nj = window
     for b in range(nj):
         node = a * nj + b
-        m = grid[node, 2]
+        m = grid[0, node, 2]
         if m > 0.0:
-            qx, qy = grid[node, 0], grid[node, 1]
+            per_m = 1.0 / m
+            u, v = grid[0, node, 0] * per_m, grid[0, node, 1] * per_m
             u_bar, v_bar = wall_adjoint(
                 i0 + a,
                 j0 + b,
-                qx / m + world.dt * world.gravity_x,
-                qy / m + world.dt * world.gravity_y,
+                u + world.dt * world.gravity_x,
+                v + world.dt * world.gravity_y,
                 world,
-                scratch.velocity_bar[node, 0],
-                scratch.velocity_bar[node, 1],
+                velocity_bar[0, 2 * node],
+                velocity_bar[0, 2 * node + 1],
             )
-            scratch.node_bar[node, 0] = u_bar / m
-            scratch.node_bar[node, 1] = v_bar / m
-            scratch.node_bar[node, 2] = -(u_bar * qx + v_bar * qy) / (m * m)
+            momentum_bar(node_bar[0], node, u, v, per_m, u_bar, v_bar)
+            if world.keep > 0.0:
+                per_m = 1.0 / grid[1, node, 2]
+                u, v = grid[1, node, 0] * per_m, grid[1, node, 1] * per_m
+                u_bar, v_bar = velocity_bar[1, 2 * node], velocity_bar[1, 2 * node + 1]
+                momentum_bar(node_bar[1], node, u, v, per_m, u_bar, v_bar)
         else:
-            scratch.node_bar[node] = 0.0
+            node_bar[:, node] = 0.0
 
 
 @jit
-def g2p(old, new, world, tile, scratch, window, first, last):
+def momentum_bar(node_bar, node, u, v, per_m, u_bar, v_bar):
+    """Adjoint of a velocity (u, v) = q / m, into a node's record."""
+    node_bar[node, 0] = u_bar * per_m
+    node_bar[node, 1] = v_bar * per_m
+    node_bar[node, 2] = -(u_bar * u + v_bar * v) * per_m
+
+
+@jit
+def g2p(old, new, world, tile, cells, first, last):
     """Grid to particle: the new velocity, affine velocity and position."""
-    i0, j0, _, nj = window
-    c, dt = 4.0 / world.dx**2, world.dt
+    dt, per_dx = world.dt, 4.0 / world.dx
     for g in range(first, last):
         t = g - first
         for k in range(4):
-            i, j = number(tile.base, 2 * t, k), number(tile.base, 2 * t + 1, k)
-            node = (int(i) - i0) * nj + int(j) - j0
-            w_x, wr_x = spreads(tile, 24 * t, k), spreads(tile, 24 * t + 3, k)
-            w_wr = blends(spreads(tile, 24 * t + 6, k), spreads(tile, 24 * t + 9, k))
-            row_0 = g2p_row(scratch.velocity, node, w_wr)
-            row_1 = g2p_row(scratch.velocity, node + nj, w_wr)
-            row_2 = g2p_row(scratch.velocity, node + 2 * nj, w_wr)
-            mean = w_x[0] * row_0 + w_x[1] * row_1 + w_x[2] * row_2  # w u, w r_y u
-            along = wr_x[0] * row_0 + wr_x[1] * row_1 + wr_x[2] * row_2  # w r_x u
+            mean, along_x, along_y = moments(cells, tile, t, k)
             set_number(new, 12 * g + 2, k, mean[0])
             set_number(new, 12 * g + 3, k, mean[1])
-            set_number(new, 12 * g + 4, k, along[0])
-            set_number(new, 12 * g + 5, k, mean[2])
-            set_number(new, 12 * g + 6, k, along[1])
-            set_number(new, 12 * g + 7, k, mean[3])
+            set_number(new, 12 * g + 4, k, along_x[0])
+            set_number(new, 12 * g + 5, k, along_y[0])
+            set_number(new, 12 * g + 6, k, along_x[1])
+            set_number(new, 12 * g + 7, k, along_y[1])
         store(new, 12 * g, load(old, 12 * g) + dt * load(new, 12 * g + 2))
         store(new, 12 * g + 1, load(old, 12 * g + 1) + dt * load(new, 12 * g + 3))
         c00, c01, c10, c11 = tensor(new, 12 * g + 4)
-        store_tensor(new, 12 * g + 4, c * c00, c * c01, c * c10, c * c11)
+        store_tensor(new, 12 * g + 4, per_dx * c00, per_dx * c01, per_dx * c10, per_dx * c11)
 
 
 @jit
-def g2p_row(velocity, n, w_wr):
-    """Sums over three nodes in a row: w u and w r u."""
-    row = w_wr[0] * load_pair(velocity, n) + w_wr[1] * load_pair(velocity, n + 1)
-    return row + w_wr[2] * load_pair(velocity, n + 2)
+def g2p_adjoint(world, tile, cells, cells_bar, bar, first, last):
+    """From x_bar', v_bar', C_bar' to velocity_bar, as moments of cells, and to x_bar, v_bar, C_bar.
 
-
-@jit
-def g2p_adjoint(old, new, world, tile, scratch, window, bar, part_window, part, first, last):
-    """From x_bar', v_bar', C_bar' to velocity_bar of the nodes; turns x_bar' into x_bar.
-
-    Velocities come from the whole window, their adjoints go to a block's part of it.
+    Without a blend v_bar and C_bar are zero here: what follows adds to them.
     """
-    i0, j0, _, nj = window
-    i1, j1, _, nl = part_window
-    c, dt, velocity = 4.0 / world.dx**2, world.dt, scratch.velocity
+    dt, per_dx = world.dt, 1.0 / world.dx
+    c, h = 4.0 * per_dx, tile.gathered
     for g in range(first, last):
         t = g - first
-        x_bar, y_bar = load(bar, 12 * g), load(bar, 12 * g + 1)
+        none = nothing(bar)
+        for axis in range(2):
+            v_bar = load(bar, 12 * g + 2 + axis)
+            store(h, 9 * t + axis, v_bar + dt * load(bar, 12 * g + axis))
+            store(bar, 12 * g + 2 + axis, world.keep * v_bar)
         c00, c01, c10, c11 = tensor(bar, 12 * g + 4)
-        c00, c01, c10, c11 = c * c00, c * c01, c * c10, c * c11
-        store_tensor(bar, 12 * g + 4, c00, c01, c10, c11)
-        add(bar, 12 * g + 2, dt * x_bar)
-        add(bar, 12 * g + 3, dt * y_bar)
-        u, v = load(new, 12 * g + 2), load(new, 12 * g + 3)
-        store(bar, 12 * g, x_bar - c00 * u - c10 * v)
-        store(bar, 12 * g + 1, y_bar - c01 * u - c11 * v)
+        store_tensor(h, 9 * t + 2, c * c00, c * c01, c * c10, c * c11)
+        store_tensor(bar, 12 * g + 4, none, none, none, none)
         for k in range(4):
-            i, j = int(number(tile.base, 2 * t, k)), int(number(tile.base, 2 * t + 1, k))
-            node, part_node = (i - i0) * nj + j - j0, (i - i1) * nl + j - j1
-            w_x, w_y = spreads(tile, 24 * t, k), spreads(tile, 24 * t + 6, k)
-            r_x, s_x = spreads(tile, 24 * t + 12, k), spreads(tile, 24 * t + 15, k)
-            r_y, s_y = spreads(tile, 24 * t + 18, k), spreads(tile, 24 * t + 21, k)
-            w_s, s_w = blends(w_y, s_y), blends(s_x, w_x)
-            v_bar = pair(number(bar, 12 * g + 2, k), number(bar, 12 * g + 3, k))
-            c0 = pair(number(bar, 12 * g + 4, k), number(bar, 12 * g + 6, k))
-            c1 = pair(number(bar, 12 * g + 5, k), number(bar, 12 * g + 7, k))
-            slope_0 = g2p_adjoint_row(
-                part, part_node, velocity, node, v_bar + r_x[0] * c0, c1, w_x[0], w_y, r_y, w_s
-            )
-            slope_1 = g2p_adjoint_row(
-                part, part_node + nl, velocity, node + nj, v_bar + r_x[1] * c0, c1, w_x[1], w_y,
-                r_y, w_s,
-            )  # fmt: skip
-            slope_2 = g2p_adjoint_row(
-                part, part_node + 2 * nl, velocity, node + 2 * nj, v_bar + r_x[2] * c0, c1, w_x[2],
-                w_y, r_y, w_s,
-            )  # fmt: skip
-            slope = s_w[0] * slope_0 + s_w[1] * slope_1 + s_w[2] * slope_2
-            set_number(bar, 12 * g, k, number(bar, 12 * g, k) + (slope[0] + slope[1]))
-            set_number(bar, 12 * g + 1, k, number(bar, 12 * g + 1, k) + (slope[2] + slope[3]))
+            v_bar = pair(number(h, 9 * t, k), number(h, 9 * t + 1, k))
+            c0 = pair(number(h, 9 * t + 2, k), number(h, 9 * t + 4, k))
+            c1 = pair(number(h, 9 * t + 3, k), number(h, 9 * t + 5, k))
+            slope_x, slope_y = slopes(cells, tile, t, k, v_bar, c0, c1)
+            deposit(cells_bar, tile, t, k, v_bar, c0, c1)
+            set_number(bar, 12 * g, k, number(bar, 12 * g, k) + per_dx * total(slope_x))
+            set_number(bar, 12 * g + 1, k, number(bar, 12 * g + 1, k) + per_dx * total(slope_y))
 
 
 @jit
-def g2p_adjoint_row(part, k, velocity, n, v_bar, c1, w_x, w, r, w_s):
-    """Add w_x w (v_bar + c1 r) to three nodes in a row; the sum of w, s times it, times u."""
-    u_bar = v_bar + r[0] * c1
-    add(part, k, (w_x * w[0]) * u_bar)
-    slope = w_s[0] * (u_bar * load_pair(velocity, n))
-    u_bar = v_bar + r[1] * c1
-    add(part, k + 1, (w_x * w[1]) * u_bar)
-    slope = slope + w_s[1] * (u_bar * load_pair(velocity, n + 1))
-    u_bar = v_bar + r[2] * c1
-    add(part, k + 2, (w_x * w[2]) * u_bar)
-    return slope + w_s[2] * (u_bar * load_pair(velocity, n + 2))
+def blend(old, new, world, tile, cells, first, last):
+    """Particles keep a share of what the transfer of their own velocity smoothed away."""
+    for g in range(first, last):
+        t = g - first
+        for k in range(4):
+            mean, _, _ = moments(cells, tile, t, k)
+            set_number(tile.gathered, 9 * t, k, mean[0])
+            set_number(tile.gathered, 9 * t + 1, k, mean[1])
+        for axis in range(2):
+            lost = load(old, 12 * g + 2 + axis) - load(tile.gathered, 9 * t + axis)
+            add(new, 12 * g + 2 + axis, world.keep * lost)
+
+
+@jit
+def blend_adjoint(world, tile, cells, cells_bar, bar, first, last):
+    """To velocity_bar of the second sheet, as moments of cells; adds to x_bar.
+
+    After `g2p_adjoint`, which leaves keep v_bar' as v_bar.
+    """
+    per_dx = 1.0 / world.dx
+    for g in range(first, last):
+        t = g - first
+        for k in range(4):
+            v_bar = pair(-number(bar, 12 * g + 2, k), -number(bar, 12 * g + 3, k))
+            none = nothing(cells)
+            slope_x, slope_y = slopes(cells, tile, t, k, v_bar, none, none)
+            deposit(cells_bar, tile, t, k, v_bar, none, none)
+            set_number(bar, 12 * g, k, number(bar, 12 * g, k) + per_dx * total(slope_x))
+            set_number(bar, 12 * g + 1, k, number(bar, 12 * g + 1, k) + per_dx * total(slope_y))
 
 
 @loop_jit
@@ -756,6 +881,8 @@ def advance(states, grids, windows, logs, first, last, body, world, signal, scra
     own = range(thread * blocks // threads, (thread + 1) * blocks // threads)
     parts, ends = scratch.parts, scratch.ends
     tile = make_tile(TILE, states)
+    node_cells, velocity_cells = make_cells(scratch)
+    sheets = len(scratch.velocity)
     for n in range(first, last + 1):
         old = states[n % states.shape[0]]
         new = states[(n + 1) % states.shape[0]]
@@ -770,18 +897,26 @@ def advance(states, grids, windows, logs, first, last, body, world, signal, scra
             elif n < last:
                 windows[slot, k, 0], windows[slot, k, 1] = i0, j0
                 windows[slot, k, 2], windows[slot, k, 3] = ni, nj
-                if ni * nj > parts.shape[1]:
+                if ni * nj > parts.shape[2]:
                     ends[k, 0] = PART_TOO_SMALL
                 else:
-                    parts[k, : ni * nj] = 0.0
+                    part = (i0, j0, ni, nj)
+                    for sheet in range(sheets):
+                        clear(node_cells[sheet], part)
                     for g0 in range(p0, p1, TILE):
                         g1 = min(g0 + TILE, p1)
                         if not deform(old, new, world, log_J, g0, g1):
                             ends[k, 0], ends[k, 1] = INVERTED, first_inverted(new, g0, g1)
                             break
-                        locate(old, world, tile, g0, g1)
-                        stress(old, new, log_J, body, world, signal[n], tile, g0, g1)
-                        p2g(old, body, world, tile, (i0, j0, ni, nj), parts[k], g0, g1)
+                        locate(old, world, part, tile, g0, g1)
+                        for sheet in range(sheets):
+                            if sheet == 0:
+                                stress(old, new, log_J, body, world, signal[n], tile, g0, g1)
+                            else:
+                                inertia(old, body, world, tile, g0, g1)
+                            p2g(old, body, tile, node_cells[sheet], g0, g1)
+                    for sheet in range(sheets):
+                        taylor_adjoint(node_cells[sheet], part, parts[k, sheet])
         if not meet(meeting, threads):
             return n, ABANDONED, -1
         for k in range(blocks):
@@ -794,27 +929,35 @@ def advance(states, grids, windows, logs, first, last, body, world, signal, scra
         if thread == 0:
             for k in range(4):
                 windows[slot, blocks, k] = window[k]
-        if ni * nj > grid.shape[0]:
+        if ni * nj > grid.shape[1]:
             return n, WINDOW_TOO_SMALL, -1
         columns = range(thread * ni // threads, (thread + 1) * ni // threads)
-        for a in columns:
-            add_blocks(parts, windows[slot], window, a, grid)
+        for sheet in range(sheets):
+            for a in columns:
+                add_blocks(parts, sheet, windows[slot], window, a, grid[sheet])
         if world.mirror_axis >= 0:
             if not meet(meeting, threads):
                 return n, ABANDONED, -1
             if thread == 0:
-                mirror(grid, window, world)
+                for sheet in range(sheets):
+                    mirror(grid[sheet], window, world)
             if not meet(meeting, threads):
                 return n, ABANDONED, -1
         for a in columns:
-            grid_update(grid, window, world, scratch, a)
+            grid_update(grid, window, world, scratch.velocity, a)
         if not meet(meeting, threads):
             return n, ABANDONED, -1
         for k in own:
+            w = windows[slot, k]
+            part = (w[0], w[1], w[2], w[3])
+            for sheet in range(sheets):
+                taylor(scratch.velocity[sheet], window, part, velocity_cells[sheet])
             for g0 in range(body.first[k], body.first[k + 1], TILE):
                 g1 = min(g0 + TILE, body.first[k + 1])
-                locate(old, world, tile, g0, g1)
-                g2p(old, new, world, tile, scratch, window, g0, g1)
+                locate(old, world, part, tile, g0, g1)
+                g2p(old, new, world, tile, velocity_cells[0], g0, g1)
+                if sheets == 2:
+                    blend(old, new, world, tile, velocity_cells[1], g0, g1)
     return last, DONE, -1
 
 
@@ -829,51 +972,75 @@ def advance_adjoint(states, grids, windows, logs, first, last, body, world, sign
     """
     blocks = body.first.size - 1
     own = range(thread * blocks // threads, (thread + 1) * blocks // threads)
-    parts = scratch.parts
+    parts_bar, velocity, velocity_bar = scratch.parts_bar, scratch.velocity, scratch.velocity_bar
     tile = make_tile(TILE, states)
+    node_cells, velocity_cells = make_cells(scratch)
+    _, velocity_cells_bar = make_cells(scratch)
+    sheets = len(velocity)
     for n in range(last - 1, first - 1, -1):
         old, new, grid, log_J = states[n], states[n + 1], grids[n], logs[n]
         w = windows[n, blocks]
         ni, window = w[2], (w[0], w[1], w[2], w[3])
         columns = range(thread * ni // threads, (thread + 1) * ni // threads)
         for a in columns:
-            grid_update(grid, window, world, scratch, a)
+            grid_update(grid, window, world, velocity, a)
         if not meet(meeting, threads):
             return
         for k in own:
             p0, p1 = body.first[k], body.first[k + 1]
             w = windows[n, k]
             part = (w[0], w[1], w[2], w[3])
-            parts[k, : w[2] * w[3]] = 0.0
+            for sheet in range(sheets):
+                taylor(velocity[sheet], window, part, velocity_cells[sheet])
+                clear(velocity_cells_bar[sheet], part)
             for g0 in range(p0, p1, TILE):
                 g1 = min(g0 + TILE, p1)
-                locate(old, world, tile, g0, g1)
-                locate_adjoint(old, world, tile, g0, g1)
-                g2p_adjoint(old, new, world, tile, scratch, window, bar, part, parts[k], g0, g1)
+                locate(old, world, part, tile, g0, g1)
+                g2p_adjoint(
+                    world, tile, velocity_cells[0], velocity_cells_bar[0], bar, g0, g1
+                )  # fmt: skip
+                if sheets == 2:
+                    blend_adjoint(
+                        world, tile, velocity_cells[1], velocity_cells_bar[1], bar, g0, g1
+                    )  # fmt: skip
+            for sheet in range(sheets):
+                taylor_adjoint(velocity_cells_bar[sheet], part, parts_bar[k, sheet])
         if not meet(meeting, threads):
             return
         for a in columns:
-            add_blocks(parts, windows[n], window, a, scratch.velocity_bar)
-            grid_update_adjoint(grid, window, world, scratch, a)
+            for sheet in range(sheets):
+                add_blocks(parts_bar, sheet, windows[n], window, a, velocity_bar[sheet])
+            grid_update_adjoint(grid, window, world, velocity_bar, scratch.node_bar, a)
         if not meet(meeting, threads):
             return
         if world.mirror_axis >= 0:
             if thread == 0:
-                mirror(scratch.node_bar, window, world)
+                for sheet in range(sheets):
+                    mirror(scratch.node_bar[sheet], window, world)
             if not meet(meeting, threads):
                 return
         for k in own:
             p0, p1 = body.first[k], body.first[k + 1]
+            w = windows[n, k]
+            part = (w[0], w[1], w[2], w[3])
+            for sheet in range(sheets):
+                taylor(scratch.node_bar[sheet], window, part, node_cells[sheet])
             for g0 in range(p0, p1, TILE):
                 g1 = min(g0 + TILE, p1)
-                locate(old, world, tile, g0, g1)
-                locate_adjoint(old, world, tile, g0, g1)
-                stress(old, new, log_J, body, world, signal[n], tile, g0, g1)
-                p2g_adjoint(old, body, world, tile, scratch, window, bar, body_bar, g0, g1)
-                stress_adjoint(
-                    old, new, log_J, body, world, signal[n], tile, bar, body_bar, signal_bar[k, n],
-                    g0, g1,
-                )  # fmt: skip
+                locate(old, world, part, tile, g0, g1)
+                for sheet in range(sheets):
+                    if sheet == 0:
+                        stress(old, new, log_J, body, world, signal[n], tile, g0, g1)
+                    else:
+                        inertia(old, body, world, tile, g0, g1)
+                    p2g_adjoint(old, body, world, tile, node_cells[sheet], bar, body_bar, g0, g1)
+                    if sheet == 0:
+                        stress_adjoint(
+                            old, new, log_J, body, world, signal[n], tile, bar, body_bar,
+                            signal_bar[k, n], g0, g1,
+                        )  # fmt: skip
+                    else:
+                        inertia_adjoint(old, body, tile, bar, body_bar, g0, g1)
                 deform_adjoint(old, world, bar, g0, g1)
 
 
@@ -918,23 +1085,26 @@ def ungrouped(records: NDArray, rows: int, particles: int) -> NDArray:
     return np.ascontiguousarray(filled[:, :particles])
 
 
-# Records of four numbers: of a node, or one number of four particles in a row. These functions on
-# numpy arrays are their definition; compiled, a record is a vector register of the processor.
+# Records of four numbers, of a node or one number of four particles in a row, and pairs. These
+# functions on numpy arrays are their definition; compiled, they are vector registers.
 
 
 def load(array, k):
-    """Record k of an array (M, 4)."""
-    return array[k].copy()
+    """Record k of an array (M, 4), or pair k of a flat array."""
+    return array[k].copy() if array.ndim == 2 else array[2 * k : 2 * k + 2].copy()
 
 
-def load_pair(array, k):
-    """The first two numbers of record k of an array (M, ...), twice."""
-    return np.tile(array[k, :2], 2)
+def nothing(array):
+    """The zeros of what `load` reads from such an array."""
+    return np.zeros(4 if array.ndim == 2 else 2, array.dtype)
 
 
 def store(array, k, record):
-    """Write record k of an array (M, 4)."""
-    array[k] = record
+    """Write what `load` reads."""
+    if array.ndim == 2:
+        array[k] = record
+    else:
+        array[2 * k : 2 * k + 2] = record
 
 
 def number(array, k, lane):
@@ -947,33 +1117,18 @@ def set_number(array, k, lane, value):
     array[k, lane] = value
 
 
-def spread(number):
-    """The record of four times the same number."""
-    return np.full(4, number)
-
-
 def pack(a, b, c, d):
     """The record of four numbers."""
     return np.array([a, b, c, d])
 
 
 def pair(a, b):
-    """The record of two numbers, twice."""
-    return np.array([a, b, a, b])
-
-
-def blend(x, y):
-    """The first half of record x and the second half of y."""
-    return np.concatenate([x[:2], y[2:]])
-
-
-def alternate(x, y):
-    """The even numbers of record x and the odd ones of y."""
-    return np.array([x[0], y[1], x[2], y[3]])
+    """The pair of two numbers."""
+    return np.array([a, b])
 
 
 def total(x):
-    """The sum of a record's numbers."""
+    """The sum of the numbers of a record or pair."""
     return x.sum()
 
 
@@ -1035,16 +1190,16 @@ def store_tensor(array, k, x00, x01, x10, x11):
 
 @jit
 def add(array, k, record):
-    """Add to record k of an array (M, 4)."""
+    """Add to what `load` reads."""
     store(array, k, load(array, k) + record)
 
 
 class Register(types.Type):
-    """A record in a vector register: four doubles, or four complex numbers as eight."""
+    """A record or a pair in a vector register; a complex number takes two of its places."""
 
-    def __init__(self, dtype):
-        self.dtype = dtype
-        super().__init__(f"Register({dtype})")
+    def __init__(self, dtype, lanes):
+        self.dtype, self.lanes = dtype, lanes
+        super().__init__(f"Register({dtype}, {lanes})")
 
 
 @register_model(Register)
@@ -1052,15 +1207,22 @@ class RegisterModel(models.PrimitiveModel):
     """As a vector of LLVM."""
 
     def __init__(self, manager, kind):
-        super().__init__(manager, kind, _vector(kind.dtype))
+        super().__init__(manager, kind, _vector(kind))
 
 
 FLAGS = ("contract", "reassoc", "nsz", "arcp")
 INT32 = ir.IntType(32)
 
 
-def _vector(dtype):
-    return ir.VectorType(ir.DoubleType(), 4 if dtype == types.float64 else 8)
+def _vector(kind):
+    """LLVM's type of a register."""
+    number = ir.FloatType() if kind.dtype == types.float32 else ir.DoubleType()
+    return ir.VectorType(number, kind.lanes * (2 if kind.dtype == types.complex128 else 1))
+
+
+def _register(array):
+    """What `load` reads from an array."""
+    return Register(array.dtype, 4 if array.ndim == 2 else 2)
 
 
 def _shuffle(builder, x, y, lanes):
@@ -1068,28 +1230,36 @@ def _shuffle(builder, x, y, lanes):
     return builder.shuffle_vector(x, y, mask)
 
 
-def _doubles(context, builder, dtype, value):
-    """The doubles of a number: one, or the parts of a complex one."""
-    if dtype == types.float64:
+def _parts(context, builder, dtype, value):
+    """A number, or the parts of a complex one."""
+    if dtype != types.complex128:
         return [value]
     value = context.make_complex(builder, dtype, value)
     return [value.real, value.imag]
 
 
-def _vector_of(context, builder, dtype, values):
-    """The vector of four numbers."""
-    vector = ir.Constant(_vector(dtype), ir.Undefined)
-    doubles = [d for value in values for d in _doubles(context, builder, dtype, value)]
-    for lane, value in enumerate(doubles):
+def _filled(context, builder, kind, values):
+    """The register of some numbers of its type."""
+    vector = ir.Constant(_vector(kind), ir.Undefined)
+    parts = [part for value in values for part in _parts(context, builder, kind.dtype, value)]
+    for lane, value in enumerate(parts):
         vector = builder.insert_element(vector, value, INT32(lane))
     return vector
 
 
+def _spread_out(context, builder, kind, value):
+    """The register of so many times the same number."""
+    parts = _parts(context, builder, kind.dtype, value)
+    vector = ir.Constant(_vector(kind), ir.Undefined)
+    for lane, part in enumerate(parts):
+        vector = builder.insert_element(vector, part, INT32(lane))
+    return _shuffle(builder, vector, vector, list(range(len(parts))) * kind.lanes)
+
+
 def _pointer(context, builder, array_type, array, k, vector, lane=None):
-    """To record k of an array (M, 4), whose strides the compiler need not look up, or to a lane."""
+    """To what `load` reads, or to one of its numbers; the compiler need not look up strides."""
     array = context.make_array(array_type)(context, builder, array)
-    width = NODE_SIZE if array_type.ndim == 2 else 1
-    place = builder.mul(k, k.type(width))
+    place = builder.mul(k, k.type(_register(array_type).lanes))
     if lane is not None:
         place = builder.add(place, lane)
     return builder.bitcast(builder.gep(array.data, [place]), vector.as_pointer())
@@ -1117,74 +1287,77 @@ def _set_number(typingctx, array, k, lane, value):
 
 @intrinsic
 def _load(typingctx, array, k):
-    def generate(context, builder, signature, arguments):
-        vector = _vector(array.dtype)
-        pointer = _pointer(context, builder, array, arguments[0], arguments[1], vector)
-        return builder.load(pointer, align=8)
+    kind = _register(array)
 
-    return Register(array.dtype)(array, types.intp), generate
+    def generate(context, builder, signature, arguments):
+        pointer = _pointer(context, builder, array, *arguments, _vector(kind))
+        return builder.load(pointer, align=4)
+
+    return kind(array, types.intp), generate
 
 
 @intrinsic
-def _load_pair(typingctx, array, k):
-    def generate(context, builder, signature, arguments):
-        half = ir.VectorType(ir.DoubleType(), _vector(array.dtype).count // 2)
-        pointer = _pointer(context, builder, array, arguments[0], arguments[1], half)
-        pair = builder.load(pointer, align=8)
-        return _shuffle(builder, pair, pair, 2 * list(range(half.count)))
+def _nothing(typingctx, array):
+    kind = _register(array)
 
-    return Register(array.dtype)(array, types.intp), generate
+    def generate(context, builder, signature, arguments):
+        return ir.Constant(_vector(kind), None)
+
+    return kind(array), generate
 
 
 @intrinsic
 def _store(typingctx, array, k, record):
+    kind = _register(array)
+
     def generate(context, builder, signature, arguments):
-        vector = _vector(array.dtype)
-        pointer = _pointer(context, builder, array, arguments[0], arguments[1], vector)
-        builder.store(arguments[2], pointer, align=8)
+        pointer = _pointer(context, builder, array, *arguments[:2], _vector(kind))
+        builder.store(arguments[2], pointer, align=4)
         return context.get_dummy_value()
 
-    return types.none(array, types.intp, Register(array.dtype)), generate
+    return types.none(array, types.intp, kind), generate
 
 
 @intrinsic
-def _pack(typingctx, a, b, c, d):
-    def generate(context, builder, signature, arguments):
-        return _vector_of(context, builder, a, arguments)
+def _pack(typingctx, numbers):
+    dtype = types.complex128 if types.complex128 in numbers.types else numbers.types[0]
+    kind = Register(dtype, len(numbers))
 
-    return Register(a)(a, a, a, a), generate
+    def generate(context, builder, signature, arguments):
+        values = cgutils.unpack_tuple(builder, arguments[0])
+        values = [
+            context.cast(builder, v, of, dtype) for v, of in zip(values, numbers.types, strict=True)
+        ]
+        return _filled(context, builder, kind, values)
+
+    return kind(numbers), generate
 
 
 @intrinsic
-def _spread(typingctx, a):
+def _as(typingctx, x, like):
+    """A number or register as a register that can be combined with another one, or a number."""
+    kind = x if isinstance(x, Register) else like
+    if types.complex128 in (getattr(x, "dtype", x), getattr(like, "dtype", like)):
+        kind = Register(types.complex128, kind.lanes)
+
     def generate(context, builder, signature, arguments):
-        vector = _vector_of(context, builder, a, arguments)
-        lanes = [0] * 4 if a == types.float64 else [0, 1] * 4
-        return _shuffle(builder, vector, vector, lanes)
+        value = arguments[0]
+        if not isinstance(x, Register):
+            value = context.cast(builder, value, x, kind.dtype)
+            return _spread_out(context, builder, kind, value)
+        if x == kind:
+            return value
+        zeros = ir.Constant(_vector(x), None)
+        lanes = [lane for k in range(x.lanes) for lane in (k, x.lanes + k)]
+        return _shuffle(builder, value, zeros, lanes)
 
-    return Register(a)(a), generate
-
-
-def _choice(second):
-    """Of two records: the numbers marked in `second` from the second one."""
-
-    @intrinsic
-    def choose(typingctx, x, y):
-        def generate(context, builder, signature, arguments):
-            width = _vector(x.dtype).count
-            of = width // 4
-            lanes = [k + width * second[k // of] for k in range(width)]
-            return _shuffle(builder, *arguments, lanes)
-
-        return x(x, x), generate
-
-    return choose
+    return kind(x, like), generate
 
 
 def _real_parts(builder, record, vector):
-    return (
-        vector if record.dtype == types.float64 else _shuffle(builder, vector, vector, [0, 2, 4, 6])
-    )
+    if record.dtype != types.complex128:
+        return vector
+    return _shuffle(builder, vector, vector, list(range(0, 2 * record.lanes, 2)))
 
 
 def _all(builder, lanes):
@@ -1195,17 +1368,22 @@ def _all(builder, lanes):
 
 @intrinsic
 def _real(typingctx, x):
+    dtype = types.float64 if x.dtype == types.complex128 else x.dtype
+
     def generate(context, builder, signature, arguments):
         return _real_parts(builder, x, arguments[0])
 
-    return Register(types.float64)(x), generate
+    return Register(dtype, x.lanes)(x), generate
 
 
 @intrinsic
 def _whole(typingctx, x):
     def generate(context, builder, signature, arguments):
-        value = builder.fptosi(arguments[0], ir.VectorType(ir.IntType(64), 4))
-        return builder.sitofp(value, _vector(types.float64))
+        vector = _vector(x)
+        name = f"llvm.trunc.v4f{32 if x.dtype == types.float32 else 64}"
+        kind = ir.FunctionType(vector, [vector])
+        function = cgutils.get_or_insert_function(builder.module, kind, name)
+        return builder.call(function, arguments)
 
     return x(x), generate
 
@@ -1232,8 +1410,6 @@ def _extreme(symbol):
 
 
 _least, _greatest = _extreme("<"), _extreme(">")
-_blend = _choice((0, 0, 1, 1))
-_alternate = _choice((0, 1, 0, 1))
 
 
 def _arithmetic(name):
@@ -1241,12 +1417,14 @@ def _arithmetic(name):
     def operate(typingctx, x, y):
         def generate(context, builder, signature, arguments):
             a, b = arguments
-            if x.dtype == types.float64 or name in ("fadd", "fsub"):
+            if x.dtype != types.complex128 or name in ("fadd", "fsub"):
                 return getattr(builder, name)(a, b, flags=FLAGS)
             # (a.re + i a.im) b = a.re b + a.im (i b)
-            re, im = [0, 0, 2, 2, 4, 4, 6, 6], [1, 1, 3, 3, 5, 5, 7, 7]
-            turned = _shuffle(builder, b, b, [1, 0, 3, 2, 5, 4, 7, 6])
-            signs = ir.Constant(_vector(x.dtype), 4 * [-1.0, 1.0])
+            re, im, turn = ([2 * k + place for k in range(x.lanes) for place in pair] for pair in (
+                (0, 0), (1, 1), (1, 0)
+            ))  # fmt: skip
+            turned = _shuffle(builder, b, b, turn)
+            signs = ir.Constant(_vector(x), x.lanes * [-1.0, 1.0])
             turned = builder.fmul(turned, signs, flags=FLAGS)
             real = builder.fmul(_shuffle(builder, a, a, re), b, flags=FLAGS)
             imaginary = builder.fmul(_shuffle(builder, a, a, im), turned, flags=FLAGS)
@@ -1262,35 +1440,8 @@ def _overload_arithmetic(symbol, name):
 
     @overload(symbol)
     def arithmetic(x, y):
-        if not (isinstance(x, Register) or isinstance(y, Register)):
-            return None
-        if types.complex128 in (getattr(x, "dtype", x), getattr(y, "dtype", y)):
-            return lambda x, y: operate(_as_complex(x), _as_complex(y))
-        return lambda x, y: operate(_as_real(x), _as_real(y))
-
-
-def _as_real(x):
-    """A record of real numbers."""
-
-
-def _as_complex(x):
-    """A record of complex numbers."""
-
-
-@overload(_as_real)
-def _overload_as_real(x):
-    if isinstance(x, Register):
-        return lambda x: x
-    return lambda x: _spread(float(x))
-
-
-@overload(_as_complex)
-def _overload_as_complex(x):
-    if not isinstance(x, Register):
-        return lambda x: _spread(complex(x))
-    if x.dtype == types.complex128:
-        return lambda x: x
-    return lambda x: _pack(complex(x[0]), complex(x[1]), complex(x[2]), complex(x[3]))
+        if isinstance(x, Register) or isinstance(y, Register):
+            return lambda x, y: operate(_as(x, y), _as(y, x))
 
 
 for _symbol, _name in (
@@ -1304,25 +1455,22 @@ for _symbol, _name in (
 @intrinsic
 def _divide(typingctx, x, y):
     def generate(context, builder, signature, arguments):
-        x_lanes, y_lanes = arguments
-        if x.dtype == types.complex128:
-            y_lanes = _shuffle(builder, y_lanes, y_lanes, [0, 0, 1, 1, 2, 2, 3, 3])
-        return builder.fdiv(x_lanes, y_lanes, flags=FLAGS)
+        return builder.fdiv(*arguments, flags=FLAGS)
 
-    return x(x, y), generate
+    return x(x, x), generate
 
 
 @overload(operator.truediv)
 def _overload_divide(x, y):
-    if isinstance(x, Register) and types.complex128 not in (y, getattr(y, "dtype", y)):
-        return lambda x, y: _divide(x, _as_real(y))
+    if isinstance(x, Register) and types.complex128 not in (x.dtype, getattr(y, "dtype", y)):
+        return lambda x, y: _divide(x, _as(y, x))
 
 
 @intrinsic
 def _lane(typingctx, record, k):
     def generate(context, builder, signature, arguments):
         lane = builder.trunc(arguments[1], INT32)
-        if record.dtype == types.float64:
+        if record.dtype != types.complex128:
             return builder.extract_element(arguments[0], lane)
         value = context.make_complex(builder, record.dtype)
         lane = builder.shl(lane, INT32(1))
@@ -1343,7 +1491,7 @@ def _getitem(record, k):
 def _positive(typingctx, record):
     def generate(context, builder, signature, arguments):
         value = _real_parts(builder, record, arguments[0])
-        zeros = ir.Constant(_vector(types.float64), None)
+        zeros = ir.Constant(value.type, None)
         return _all(builder, builder.fcmp_ordered(">", value, zeros))
 
     return types.boolean(record), generate
@@ -1353,19 +1501,28 @@ def _positive(typingctx, record):
 def _exponent_and_fraction(typingctx, record):
     """x = 2^k m with m from sqrt(1/2) to sqrt(2): the records of k and m."""
     result = types.UniTuple(record, 2)
+    single = record.dtype == types.float32
+    width, fraction, bias = (32, 23, 127) if single else (64, 52, 1023)
+    numbers = np.float32 if single else np.float64
 
     def generate(context, builder, signature, arguments):
-        integers = ir.VectorType(ir.IntType(64), 4)
+        integers = ir.VectorType(ir.IntType(width), 4)
 
         def constant(value):
             return ir.Constant(integers, 4 * [value])
 
+        def bits_of(number):
+            return int(numbers(number).view(np.int32 if single else np.int64))
+
         bits = builder.bitcast(arguments[0], integers)
-        half = constant(int(np.float64(0.5**0.5).view(np.int64)))
-        k = builder.ashr(builder.sub(bits, half), constant(52))
-        m = builder.bitcast(builder.sub(bits, builder.shl(k, constant(52))), _vector(record.dtype))
-        k = builder.sitofp(k, _vector(record.dtype))
-        return context.make_tuple(builder, result, [k, m])
+        shifted = builder.add(bits, constant(bits_of(1.0) - bits_of(0.5**0.5)))
+        exponent = builder.lshr(shifted, constant(fraction))
+        power = builder.shl(exponent, constant(fraction))
+        m = builder.sub(builder.add(bits, constant(bits_of(1.0))), power)
+        short = ir.VectorType(INT32, 4)  # processors convert no longer integers in a register
+        k = exponent if single else builder.trunc(exponent, short)
+        k = builder.sitofp(builder.sub(k, ir.Constant(short, 4 * [bias])), _vector(record))
+        return context.make_tuple(builder, result, [k, builder.bitcast(m, _vector(record))])
 
     return result(record), generate
 
@@ -1395,9 +1552,9 @@ def _overload_load(array, k):
     return lambda array, k: _load(array, k)
 
 
-@overload(load_pair)
-def _overload_load_pair(array, k):
-    return lambda array, k: _load_pair(array, k)
+@overload(nothing)
+def _overload_nothing(array):
+    return lambda array: _nothing(array)
 
 
 @overload(store)
@@ -1417,31 +1574,18 @@ def _overload_set_number(array, k, lane, value):
 
 @overload(pair)
 def _overload_pair(a, b):
-    return lambda a, b: _pack(a, b, a, b)
-
-
-@overload(spread)
-def _overload_spread(number):
-    return lambda number: _spread(number)
+    return lambda a, b: _pack((a, b))
 
 
 @overload(pack)
 def _overload_pack(a, b, c, d):
-    return lambda a, b, c, d: _pack(a, b, c, d)
-
-
-@overload(blend)
-def _overload_blend(x, y):
-    return lambda x, y: _blend(x, y)
-
-
-@overload(alternate)
-def _overload_alternate(x, y):
-    return lambda x, y: _alternate(x, y)
+    return lambda a, b, c, d: _pack((a, b, c, d))
 
 
 @overload(total)
 def _overload_total(x):
+    if x.lanes == 2:
+        return lambda x: x[0] + x[1]
     return lambda x: (x[0] + x[1]) + (x[2] + x[3])
 
 
@@ -1457,7 +1601,7 @@ def _overload_whole(x):
 
 @overload(within)
 def _overload_within(x, low, high):
-    return lambda x, low, high: _within(x, low, high)
+    return lambda x, low, high: _within(x, _as(low, x), _as(high, x))
 
 
 @overload(least)
@@ -1477,15 +1621,20 @@ def _overload_positive(x):
 
 @overload(logarithm)
 def _overload_logarithm(x):
-    if x.dtype == types.float64:
+    if x.dtype != types.complex128:
         return lambda x: _log(x)
-    return lambda x: _pack(np.log(x[0]), np.log(x[1]), np.log(x[2]), np.log(x[3]))
+    return lambda x: _pack((np.log(x[0]), np.log(x[1]), np.log(x[2]), np.log(x[3])))
+
+
+def _place(context, builder, array_type, array, k):
+    """To number k of a flat array."""
+    return builder.gep(context.make_array(array_type)(context, builder, array).data, [k])
 
 
 @intrinsic
 def _atomic_add(typingctx, array, k, amount):
     def generate(context, builder, signature, arguments):
-        pointer = _pointer(context, builder, array, arguments[0], arguments[1], ir.IntType(64))
+        pointer = _place(context, builder, array, *arguments[:2])
         return builder.atomic_rmw("add", pointer, arguments[2], "seq_cst")
 
     return types.int64(array, types.intp, types.int64), generate
@@ -1494,7 +1643,7 @@ def _atomic_add(typingctx, array, k, amount):
 @intrinsic
 def _atomic_load(typingctx, array, k):
     def generate(context, builder, signature, arguments):
-        pointer = _pointer(context, builder, array, arguments[0], arguments[1], ir.IntType(64))
+        pointer = _place(context, builder, array, *arguments)
         return builder.load_atomic(pointer, "seq_cst", align=8)
 
     return types.int64(array, types.intp), generate

@@ -15,7 +15,7 @@ from mpmopt.errors import DesignError, SimulationError
 from mpmopt.objective import Objective
 from mpmopt.particles import lay_out, nearest_designed
 from mpmopt.scene import Scene
-from mpmopt.simulate import Simulation
+from mpmopt.simulate import Memory, Precision, Simulation
 
 
 class Variables(NamedTuple):
@@ -56,6 +56,8 @@ class Problem:
         Design particles whose gamma is below this are not simulated. Their void weighs nothing
         then, cannot be flung about, and costs no time; they return when the filter brings them
         back. The objective jumps where gamma crosses this; its gradient is that between jumps.
+    precision : {"double", "single"}, optional
+        Of the simulation (`Simulation`).
 
     Attributes
     ----------
@@ -76,8 +78,11 @@ class Problem:
         beta: float = 1.0,
         checkpointing: Checkpointing | None = None,
         leave_out: float = 0.0,
+        precision: Precision = "double",
     ) -> None:
         self.scene = scene
+        self.precision: Precision = precision
+        self._memories: list[Memory] = []
         self.leave_out = share("Problem", "leave_out", leave_out, error=DesignError)
         self.checkpointing = checkpointing or Checkpointing()
         self.particles = lay_out(scene)
@@ -152,6 +157,7 @@ class Problem:
             lame_lambda,
             lame_mu,
             signal(self.scene, a, theta, b),
+            precision=self.precision,
         )
 
     def objective(self, simulation: Simulation) -> Objective:
@@ -183,11 +189,13 @@ class Problem:
         """
         phi, a, theta, _ = self.split(_real("x", x))
         simulation = self.simulation(x)
+        memory = self._memories.pop() if self._memories else Memory()
         with simulation.checkpoints(self.checkpointing) as checkpoints:
-            forward = simulation.forward(checkpoints)
+            forward = simulation.forward(checkpoints, memory)
             objective = self.objective(simulation)
             value = float(_finite(objective.value(forward.state), simulation))
             gradient = forward.reverse(objective.seed(forward.state))
+        self._memories.append(memory)
         bars = np.zeros((3, len(self.particles.position)))
         bars[:, self.present(phi)] = gradient.density, gradient.lame_lambda, gradient.lame_mu
         phi_bar = self.chain.pullback(phi, *bars)

@@ -280,6 +280,10 @@ class Scene(_Checked):
         as in the paper.
     mirror : Mirror, optional
         Plane about which all of the scene is symmetric. Body and walls are given whole.
+    blend_time : float, optional
+        Time tau in which particles lose what the transfer to the grid and back smooths away: they
+        keep a share exp(-time_step / tau) of it in every step, so that damping is a rate and not
+        a matter of the step. Zero is the affine transfer, as in the paper: they keep nothing.
 
     Raises
     ------
@@ -299,6 +303,7 @@ class Scene(_Checked):
     filter_weights: tuple[float, float, float] = (0.64, 0.08, 0.01)
     filter_length: float = 0.0
     mirror: Mirror | None = None
+    blend_time: float = 0.0
 
     def __post_init__(self) -> None:
         for name, kind in (("grid", Grid), ("material", Material)):
@@ -318,6 +323,7 @@ class Scene(_Checked):
             direction=_vector("Scene", "direction", self.direction),
             particles_per_cell=count("Scene", "particles_per_cell", self.particles_per_cell, 1),
             filter_length=number("Scene", "filter_length", self.filter_length),
+            blend_time=number("Scene", "blend_time", self.blend_time),
             filter_weights=_tuple(
                 "Scene",
                 "filter_weights",
@@ -337,8 +343,9 @@ class Scene(_Checked):
                 f"Scene: filter_weights sum to w0 + 4 w1 + 4 w2 = {w0 + 4 * w1 + 4 * w2:.15g}, "
                 "must sum to 1"
             )
-        if self.filter_length < 0.0:
-            raise SceneError(f"Scene: filter_length = {self.filter_length:g} must not be negative")
+        for name in ("filter_length", "blend_time"):
+            if getattr(self, name) < 0.0:
+                raise SceneError(f"Scene: {name} = {getattr(self, name):g} must not be negative")
         if self.filter_passes > MOST_PASSES:
             raise SceneError(
                 f"Scene: filter_length = {self.filter_length:g} takes {self.filter_passes} passes, "

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
+from typing import Literal
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -17,6 +18,8 @@ from mpmopt.errors import DesignError, SimulationError
 from mpmopt.particles import Particles
 from mpmopt.scene import ROUNDING, Scene
 from mpmopt.threads import together
+
+Precision = Literal["double", "single"]
 
 # Kernels return to Python after so many steps times particles, so that signals are heard in time.
 WORK_PER_CALL = 500_000
@@ -52,6 +55,7 @@ def world_of(scene: Scene) -> mpm.World:
         ),
         mirror_axis=-1 if scene.mirror is None else scene.mirror.normal,
         mirror_node=0 if scene.mirror is None else round(scene.mirror.position / dx),
+        keep=math.exp(-scene.time_step / scene.blend_time) if scene.blend_time else 0.0,
     )
 
 
@@ -89,6 +93,8 @@ class Simulation:
         Of the scene's K actuators; real or complex.
     state : (12, N) array, optional
         Initial state (layout: `mpmopt.mpm`); default: at rest and undeformed.
+    precision : {"double", "single"}, optional
+        Of all numbers. Single is for looks ahead: its gradients lose digits with every step.
 
     Raises
     ------
@@ -105,13 +111,18 @@ class Simulation:
         lame_mu: NDArray,
         signal: NDArray,
         state: NDArray | None = None,
+        precision: Precision = "double",
     ) -> None:
+        if precision not in ("double", "single"):
+            raise DesignError(f'precision = {precision!r} must be "double" or "single"')
         count = len(particles.position)
         if state is None:
             state = np.zeros((mpm.STATE_SIZE, count))
             state[0:2] = particles.position.T
             state[8] = state[11] = 1.0
         dtype = np.result_type(density, lame_lambda, lame_mu, signal, state, float)
+        if precision == "single" and dtype.kind == "f":
+            dtype = np.dtype(np.float32)
         shapes = {
             "density": (density, (count,)),
             "lame_lambda": (lame_lambda, (count,)),
@@ -128,6 +139,7 @@ class Simulation:
             raise DesignError("the body has no particles")
         if not np.real(density).min() > 0.0:
             raise DesignError(f"density {np.real(density).min():g} must be above 0")
+        real = np.empty(0, dtype).real.dtype
         self.scene = scene
         self.particles = particles
         self.world = world_of(scene)
@@ -139,7 +151,7 @@ class Simulation:
             lame_lambda=mpm.grouped(np.asarray(lame_lambda, dtype=dtype)),
             lame_mu=mpm.grouped(np.asarray(lame_mu, dtype=dtype)),
             active=np.any(actuator >= 0, axis=1),
-            actuated=(actuator == np.arange(len(stress))[:, None, None]).astype(float),
+            actuated=(actuator == np.arange(len(stress))[:, None, None]).astype(real),
             actuation_stress=np.array(stress, dtype=float).reshape(-1, 3),
             first=np.linspace(
                 0, -(-count // 4), min(max(count // BLOCK, 1), BLOCKS) + 1, dtype=np.int64
@@ -168,7 +180,7 @@ class Simulation:
         wanted = [self.scene.steps] if frames is None else list(frames)
         if wanted != sorted(wanted) or (wanted and not 0 <= wanted[0] <= wanted[-1] <= self.steps):
             raise DesignError(f"frames must increase from 0 to {self.steps}, got {wanted}")
-        memory = _Segment(self, 1)
+        memory = _Segment(self, 1, Memory())
         states = memory.states
         states[0] = mpm.grouped(self.initial)
         kept = []
@@ -181,6 +193,11 @@ class Simulation:
                 step = last
             kept.append(mpm.ungrouped(states[0], *self.initial.shape))
         return kept[-1] if frames is None else np.array(kept)
+
+    @property
+    def sheets(self) -> int:
+        """Sheets of nodes: two where particles keep a share of their own velocity, else one."""
+        return 2 if self.world.keep > 0.0 else 1
 
     @property
     def steps(self) -> int:
@@ -223,7 +240,8 @@ class Simulation:
         groups, dtype = self.body.mass.shape[0], self.initial.dtype
         states, log = (mpm.STATE_SIZE * groups, 4), (groups, 4)
         nodes, _ = self.room
-        numbers = math.prod(states) + math.prod(log) + mpm.NODE_SIZE * nodes
+        grid = (self.sheets, nodes, mpm.NODE_SIZE)
+        numbers = math.prod(states) + math.prod(log) + math.prod(grid)
         step_bytes = numbers * dtype.itemsize
         schedule = Schedule.choose(self.steps, step_bytes, wish)
         length = schedule.segment
@@ -233,14 +251,20 @@ class Simulation:
         if schedule.all_stored:
             arrays = {
                 "states": ((length + 1, *states), dtype),
-                "grids": ((length, nodes, mpm.NODE_SIZE), dtype),
+                "grids": ((length, *grid), dtype),
                 "windows": ((length, len(self.body.first), 4), np.int64),
                 "logs": ((length, *log), dtype),
             }
         return Checkpoints(schedule, arrays, wish.store)
 
-    def forward(self, checkpoints: Checkpoints) -> Forward:
+    def forward(self, checkpoints: Checkpoints, memory: Memory | None = None) -> Forward:
         """Run forward, storing what the checkpoints' schedule asks for.
+
+        Parameters
+        ----------
+        checkpoints : Checkpoints
+        memory : Memory, optional
+            Of an earlier run whose gradient was taken.
 
         Raises
         ------
@@ -248,40 +272,62 @@ class Simulation:
             As `run`.
         """
         schedule = checkpoints.schedule
-        memory = _Segment(self, schedule.segment)
-        memory.states[0] = mpm.grouped(self.initial)
+        segment = _Segment(self, schedule.segment, memory or Memory())
+        segment.states[0] = mpm.grouped(self.initial)
         for index, (first, last) in enumerate(schedule.segments):
             if not schedule.all_stored:
-                state = mpm.ungrouped(memory.states[0], *self.initial.shape)
+                state = mpm.ungrouped(segment.states[0], *self.initial.shape)
                 checkpoints.write(index, state=state)
-            memory.advance(first, last)
+            segment.advance(first, last)
             if last < schedule.steps:
                 if schedule.all_stored:
-                    memory.store(index, checkpoints)
-                memory.states[0] = memory.states[last - first]
-        return Forward(self, checkpoints, memory)
+                    segment.store(index, checkpoints)
+                segment.states[0] = segment.states[last - first]
+        return Forward(self, checkpoints, segment)
+
+
+class Memory:
+    """Working memory that one run leaves to the next.
+
+    Memory that is new to a process costs more time than what a run writes into it.
+    """
+
+    def __init__(self) -> None:
+        self._buffers: dict[str, NDArray[np.uint8]] = {}
+
+    def take(self, name: str, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray:
+        """An array with any content, in the place of the last one of that name."""
+        size = math.prod(shape) * np.dtype(dtype).itemsize
+        if name not in self._buffers or self._buffers[name].size < size:
+            self._buffers[name] = np.empty(size, np.uint8)
+        return self._buffers[name][:size].view(dtype).reshape(shape)
 
 
 class _Segment:
-    """Working memory of a segment: what `mpm.advance` leaves of its steps, and scratch arrays."""
+    """What `mpm.advance` leaves of the steps of a segment, and scratch arrays."""
 
-    def __init__(self, simulation: Simulation, length: int) -> None:
-        self.simulation = simulation
+    def __init__(self, simulation: Simulation, length: int, memory: Memory) -> None:
+        self.simulation, self.memory = simulation, memory
         groups, dtype = simulation.body.mass.shape[0], simulation.initial.dtype
-        self.states = np.empty((length + 1, mpm.STATE_SIZE * groups, 4), dtype)
+        states = (length + 1, mpm.STATE_SIZE * groups, 4)
+        self.states = memory.take("states", states, dtype)
         self.blocks = len(simulation.body.first) - 1
         self.windows = np.zeros((length, self.blocks + 1, 4), np.int64)
-        self.logs = np.empty((length, groups, 4), dtype)
-        self.grids = np.empty((length, 0, mpm.NODE_SIZE), dtype)
+        self.logs = memory.take("logs", (length, groups, 4), dtype)
+        self.grids = np.empty((length, simulation.sheets, 0, mpm.NODE_SIZE), dtype)
         self.recomputed: set[int] = set()  # segments whose windows outgrew their room in the store
         self.resize(*simulation.room)
 
     def resize(self, nodes: int, part: int) -> None:
         """Make room for windows of so many nodes, and so many in a block's, keeping the grids."""
-        kept = self.grids
-        self.grids = np.empty((len(kept), nodes, mpm.NODE_SIZE), kept.dtype)
-        self.grids[:, : kept.shape[1]] = kept
-        self.scratch = mpm.Scratch.make(nodes, self.blocks, part, kept.dtype)
+        kept, sheets = self.grids, self.simulation.sheets
+        shape = (len(kept), sheets, nodes, mpm.NODE_SIZE)
+        if kept.size == 0:
+            self.grids = self.memory.take("grids", shape, kept.dtype)
+        else:
+            self.grids = np.empty(shape, kept.dtype)
+            self.grids[:, :, : kept.shape[2]] = kept
+        self.scratch = mpm.Scratch.make(sheets, nodes, self.blocks, part, kept.dtype)
 
     def advance(self, first: int, last: int) -> None:
         """Advance from step `first`, whose state is in slot 0, to step `last`."""
@@ -305,7 +351,7 @@ class _Segment:
                 signal,
                 self.scratch,
             )
-            nodes, part = self.grids.shape[1], self.scratch.parts.shape[1]
+            nodes, part = self.grids.shape[2], self.scratch.parts.shape[2]
             window = self.windows[reached % len(self.windows), :, 2:].prod(axis=1)
             if end == mpm.WINDOW_TOO_SMALL:
                 self.resize(int(1.25 * window[-1]), part)
@@ -324,7 +370,7 @@ class _Segment:
             self.recomputed.add(index)
             checkpoints.write(index, states=self.states)
         else:
-            grids = self.grids[:, :used]
+            grids = self.grids[:, :, :used]
             checkpoints.write(
                 index, states=self.states, grids=grids, windows=self.windows, logs=self.logs
             )
@@ -342,7 +388,7 @@ class _Segment:
             self.windows[:] = checkpoints.read(index, "windows")
             self.logs[:] = checkpoints.read(index, "logs")
             grids = checkpoints.read(index, "grids")
-            self.grids[:, : grids.shape[1]] = grids
+            self.grids[:, :, : grids.shape[2]] = grids
 
 
 class Forward:
@@ -383,15 +429,16 @@ class Forward:
         self._reversed = True
         simulation, memory = self._simulation, self._memory
         schedule = self._checkpoints.schedule
-        bar, count = mpm.grouped(seed, repeat=False), seed.shape[1]
-        body_bar = mpm.BodyBar.zeros(len(simulation.body.mass))
+        dtype, count = simulation.initial.dtype, seed.shape[1]
+        bar = mpm.grouped(seed.astype(dtype), repeat=False)
+        body_bar = mpm.BodyBar.zeros(len(simulation.body.mass), dtype)
         signal_bar = np.zeros_like(simulation.signal)
         segments = schedule.segments
         for index in range(len(segments) - 1, -1, -1):
             first, last = segments[index]
             if last < schedule.steps:
                 memory.recall(index, first, last, self._checkpoints)
-            part_bar = np.zeros((memory.blocks, *signal_bar[first:last].shape))
+            part_bar = np.zeros((memory.blocks, *signal_bar[first:last].shape), dtype)
             for stop in range(last - first, 0, -simulation.steps_per_call):
                 start = max(0, stop - simulation.steps_per_call)
                 together(

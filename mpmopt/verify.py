@@ -105,6 +105,14 @@ def kernel_mismatches(scene: Scene, seed: int = 0) -> dict[str, float]:
         )
         for name, (function, adjoint, keys) in tests.items()
     }
+    if scene.blend_time:
+        tests = {
+            "inertia": (bench.inertia, bench.inertia_adjoint, "affine_velocity mass"),
+            "blend": (bench.blend, bench.blend_adjoint, "position velocity node_velocity"),
+        }
+        for name, (function, adjoint, keys) in tests.items():
+            inputs = {key: bench.inputs[key] for key in keys.split()}
+            result[name] = dot_product_mismatch(function, adjoint, inputs, rng)
     if scene.mirror is not None:
         grid = {"grid": rng.standard_normal((bench.nodes, 3))}
         result["mirror"] = dot_product_mismatch(
@@ -173,7 +181,7 @@ class _Bench:
         if not inside:
             raise DesignError("a particle is outside the grid")
         self.window = tuple(window)
-        self.nodes = window[2] * window[3]
+        self.nodes, self.sheets = window[2] * window[3], sample.sheets
         affine = rng.standard_normal((4, count)) * np.mean(sample.body.mass) * speed
         self.inputs: Arrays = {
             "position": self.state[0:2],
@@ -190,17 +198,28 @@ class _Bench:
         }
         grid = self.p2g(self.inputs)["grid"]
         self.mass_grid = grid[:, 2]
-        self.inputs["grid"] = grid[grid[:, 2] > 0.0]
+        self.inputs["grid"] = np.stack(self.sheets * [grid[grid[:, 2] > 0.0]])
 
     def _tile(self, records: NDArray) -> mpm.Tile:
         """Of all groups, located."""
         tile = mpm.make_tile(self.all[1], records)
-        mpm.locate(records, self.world, tile, *self.all)
-        mpm.locate_adjoint(records, self.world, tile, *self.all)
+        mpm.locate(records, self.world, self.window, tile, *self.all)
         return tile
 
     def _scratch(self, dtype: type) -> mpm.Scratch:
-        return mpm.Scratch.make(self.nodes, 1, self.nodes, dtype)
+        return mpm.Scratch.make(self.sheets, self.nodes, 1, self.nodes, dtype)
+
+    def _cells(self, nodes: NDArray) -> NDArray:
+        """Taylor coefficients of a field on the nodes."""
+        cells = np.zeros((9 * self.nodes, 4) if nodes.ndim == 2 else 18 * self.nodes, nodes.dtype)
+        mpm.taylor(nodes, self.window, self.window, cells)
+        return cells
+
+    def _nodes(self, cells: NDArray) -> NDArray:
+        """What cells' moments put on the nodes."""
+        nodes = np.zeros((self.nodes, 4) if cells.ndim == 2 else 2 * self.nodes, cells.dtype)
+        mpm.taylor_adjoint(cells, self.window, nodes)
+        return nodes
 
     def _particles(self, records: NDArray, rows: int) -> NDArray:
         return mpm.ungrouped(records, rows, self.state.shape[1])
@@ -256,16 +275,14 @@ class _Bench:
         state, body = self._state(v, dtype), self._body(v, dtype)
         tile, log_J = self._tile(state), _log_jacobian(state)
         mpm.stress(state, state, log_J, body, self.world, v["signal"], tile, *self.all)
-        return {"affine": self._particles(tile.affine, 4)}
+        return {"affine": self._particles(tile.affine, 4) / self.world.dx}
 
     def stress_adjoint(self, v: Arrays, w: Arrays) -> Arrays:
         state, body = self._state(v, float), self._body(v, float)
         tile, log_J = self._tile(state), _log_jacobian(state)
         bar, body_bar = np.zeros_like(state), self._body_bar()
         signal_bar = 0.0 * v["signal"]
-        gathered = np.zeros((8, self.state.shape[1]))
-        gathered[:4] = w["affine"]
-        tile.gathered[:] = mpm.grouped(gathered, repeat=False)
+        self._gather(tile, w["affine"])
         given = (state, state, log_J, body, self.world, v["signal"], tile)
         mpm.stress_adjoint(*given, bar, body_bar, signal_bar, *self.all)
         bar = self._particles(bar, 12)
@@ -276,27 +293,47 @@ class _Bench:
             "signal": signal_bar,
         }
 
+    def _gather(self, tile: mpm.Tile, affine_bar: NDArray) -> None:
+        gathered = np.zeros((9, self.state.shape[1]))
+        gathered[:4] = affine_bar
+        tile.gathered[:] = mpm.grouped(gathered, repeat=False)
+
+    def inertia(self, v: Arrays) -> Arrays:
+        dtype = np.result_type(*v.values()).type
+        state, body = self._state(v, dtype), self._body(v, dtype)
+        tile = self._tile(state)
+        mpm.inertia(state, body, self.world, tile, *self.all)
+        return {"affine": self._particles(tile.affine, 4) / self.world.dx}
+
+    def inertia_adjoint(self, v: Arrays, w: Arrays) -> Arrays:
+        state, body = self._state(v, float), self._body(v, float)
+        tile, bar, body_bar = self._tile(state), np.zeros_like(state), self._body_bar()
+        self._gather(tile, w["affine"])
+        mpm.inertia_adjoint(state, body, tile, bar, body_bar, *self.all)
+        bar = self._particles(bar, 12)
+        return {"affine_velocity": bar[4:8], "mass": self._particles(body_bar.mass, 1)}
+
     def p2g(self, v: Arrays) -> Arrays:
         dtype = np.result_type(*v.values()).type
         state, body = self._state(v, dtype), self._body(v, dtype)
-        tile, grid = self._tile(state), np.zeros((self.nodes, mpm.NODE_SIZE), dtype)
-        tile.affine[:] = mpm.grouped(v["affine"])
-        mpm.p2g(state, body, self.world, tile, self.window, grid, *self.all)
-        return {"grid": grid[:, :3]}
+        tile, cells = self._tile(state), np.zeros((9 * self.nodes, 4), dtype)
+        tile.affine[:] = mpm.grouped(v["affine"] * self.world.dx)
+        mpm.p2g(state, body, tile, cells, *self.all)
+        return {"grid": self._nodes(cells)[:, :3]}
 
     def p2g_adjoint(self, v: Arrays, w: Arrays) -> Arrays:
         state, body = self._state(v, float), self._body(v, float)
-        tile, scratch, body_bar = self._tile(state), self._scratch(float), self._body_bar()
-        bar = np.zeros_like(state)
-        tile.affine[:] = mpm.grouped(v["affine"])
-        scratch.node_bar[:, :3] = w["grid"]
-        given = (state, body, self.world, tile, scratch, self.window)
-        mpm.p2g_adjoint(*given, bar, body_bar, *self.all)
+        tile, bar, body_bar = self._tile(state), np.zeros_like(state), self._body_bar()
+        tile.affine[:] = mpm.grouped(v["affine"] * self.world.dx)
+        nodes = np.zeros((self.nodes, mpm.NODE_SIZE))
+        nodes[:, :3] = w["grid"]
+        cells = self._cells(nodes)
+        mpm.p2g_adjoint(state, body, self.world, tile, cells, bar, body_bar, *self.all)
         bar = self._particles(bar, 12)
         return {
             "position": bar[0:2],
             "velocity": bar[2:4],
-            "affine": self._particles(tile.gathered, 8)[:4],
+            "affine": self._particles(tile.gathered, 9)[:4],
             "mass": self._particles(body_bar.mass, 1),
         }
 
@@ -307,41 +344,62 @@ class _Bench:
         return {"grid": records[:, :3]}
 
     def _grid(self, v: Arrays, dtype: type) -> NDArray:
-        grid = np.zeros((self.nodes, mpm.NODE_SIZE), dtype)
-        grid[self.mass_grid > 0.0, :3] = v["grid"]
+        grid = np.zeros((self.sheets, self.nodes, mpm.NODE_SIZE), dtype)
+        grid[:, self.mass_grid > 0.0, :3] = v["grid"]
         return grid
 
     def grid_update(self, v: Arrays) -> Arrays:
         dtype = np.result_type(*v.values()).type
         scratch, grid = self._scratch(dtype), self._grid(v, dtype)
         for column in range(self.window[2]):
-            mpm.grid_update(grid, self.window, self.world, scratch, column)
-        return {"velocity": scratch.velocity[:, :2]}
+            mpm.grid_update(grid, self.window, self.world, scratch.velocity, column)
+        return {"velocity": scratch.velocity}
 
     def grid_update_adjoint(self, v: Arrays, w: Arrays) -> Arrays:
         scratch, grid = self._scratch(float), self._grid(v, float)
-        scratch.velocity_bar[:, :2] = w["velocity"]
         for column in range(self.window[2]):
-            mpm.grid_update_adjoint(grid, self.window, self.world, scratch, column)
-        return {"grid": scratch.node_bar[:, :3][self.mass_grid > 0.0]}
+            mpm.grid_update_adjoint(
+                grid, self.window, self.world, w["velocity"], scratch.node_bar, column
+            )
+        return {"grid": scratch.node_bar[:, self.mass_grid > 0.0, :3]}
 
     def g2p(self, v: Arrays) -> Arrays:
-        return {"new": self._particles(self._after_g2p(v)[1], 12)[0:8]}
-
-    def _after_g2p(self, v: Arrays) -> tuple[NDArray, NDArray, mpm.Scratch]:
-        dtype = np.result_type(*v.values()).type
-        old, scratch = self._state(v, dtype), self._scratch(dtype)
+        old, cells = self._before_g2p(v)
         new = np.zeros_like(old)
-        scratch.velocity[:, :2] = v["node_velocity"]
-        mpm.g2p(old, new, self.world, self._tile(old), scratch, self.window, *self.all)
-        return old, new, scratch
+        mpm.g2p(old, new, self.world, self._tile(old), cells, *self.all)
+        return {"new": self._particles(new, 12)[0:8]}
+
+    def _before_g2p(self, v: Arrays) -> tuple[NDArray, NDArray]:
+        dtype = np.result_type(*v.values()).type
+        return self._state(v, dtype), self._cells(v["node_velocity"].astype(dtype).ravel())
 
     def g2p_adjoint(self, v: Arrays, w: Arrays) -> Arrays:
-        old, new, scratch = self._after_g2p(v)
-        bar, part = self._bar(0, w["new"]), scratch.parts[0]
-        given = (old, new, self.world, self._tile(old), scratch, self.window)
-        mpm.g2p_adjoint(*given, bar, self.window, part, *self.all)
-        return {"position": self._particles(bar, 12)[0:2], "node_velocity": part[:, :2]}
+        old, cells = self._before_g2p(v)
+        bar, cells_bar = self._bar(0, w["new"]), np.zeros_like(cells)
+        # What stays of v_bar' is the blend's.
+        world = self.world._replace(keep=0.0)
+        mpm.g2p_adjoint(world, self._tile(old), cells, cells_bar, bar, *self.all)
+        return {
+            "position": self._particles(bar, 12)[0:2],
+            "node_velocity": self._nodes(cells_bar).reshape(-1, 2),
+        }
+
+    def blend(self, v: Arrays) -> Arrays:
+        old, cells = self._before_g2p(v)
+        new = np.zeros_like(old)
+        mpm.blend(old, new, self.world, self._tile(old), cells, *self.all)
+        return {"new": self._particles(new, 12)[2:4]}
+
+    def blend_adjoint(self, v: Arrays, w: Arrays) -> Arrays:
+        old, cells = self._before_g2p(v)
+        bar, cells_bar = self._bar(2, self.world.keep * w["new"]), np.zeros_like(cells)
+        mpm.blend_adjoint(self.world, self._tile(old), cells, cells_bar, bar, *self.all)
+        bar = self._particles(bar, 12)
+        return {
+            "position": bar[0:2],
+            "velocity": bar[2:4],
+            "node_velocity": self._nodes(cells_bar).reshape(-1, 2),
+        }
 
 
 def _log_jacobian(records: NDArray) -> NDArray:

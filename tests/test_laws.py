@@ -192,8 +192,9 @@ def manufactured_error(n, amplitude, courant=0.2, per_cell=2):
     every, window = (0, groups), (0, 0, side, side)
     old = mpm.grouped(old)
     new = old.copy()
-    grid = np.zeros((side * side, mpm.NODE_SIZE))
-    scratch, tile = mpm.Scratch.make(side * side, 1, 0), mpm.make_tile(groups, old)
+    nodes, velocity = np.zeros((1, side * side, mpm.NODE_SIZE)), np.zeros((1, 2 * side * side))
+    cells, velocity_cells = np.zeros((9 * side * side, 4)), np.zeros(18 * side * side)
+    tile, grid = mpm.make_tile(groups, old), nodes[0]
     log_J = np.zeros((groups, 4))
     worst = 0.0
     for step in range(steps):
@@ -201,15 +202,17 @@ def manufactured_error(n, amplitude, courant=0.2, per_cell=2):
         old[2::12] += mpm.grouped(push[:1])
         old[3::12] += mpm.grouped(push[1:])
         mpm.deform(old, new, world, log_J, *every)
-        mpm.locate(old, world, tile, *every)
+        mpm.locate(old, world, window, tile, *every)
         mpm.stress(old, new, log_J, body, world, np.zeros(0), tile, *every)
-        grid[:] = 0.0
-        mpm.p2g(old, body, world, tile, window, grid, *every)
+        cells[:] = 0.0
+        mpm.p2g(old, body, tile, cells, *every)
+        mpm.taylor_adjoint(cells, window, grid)
         mirror(grid.reshape(side, side, 4), 0, n)
         mirror(grid.reshape(side, side, 4).transpose(1, 0, 2), 1, n)
         for column in range(side):
-            mpm.grid_update(grid, window, world, scratch, column)
-        mpm.g2p(old, new, world, tile, scratch, window, *every)
+            mpm.grid_update(nodes, window, world, velocity, column)
+        mpm.taylor(velocity[0], window, window, velocity_cells)
+        mpm.g2p(old, new, world, tile, velocity_cells, *every)
         old, new = new, old
         u, _ = exact((step + 1) * dt)
         error = mpm.ungrouped(old, *shape)[0:2] - offset - X - u

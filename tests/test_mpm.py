@@ -8,6 +8,7 @@ from conftest import small_scene
 
 from mpmopt import mpm
 from mpmopt.particles import lay_out
+from mpmopt.plain import step
 from mpmopt.scene import Solid, Wall
 from mpmopt.simulate import Simulation, world_of
 from mpmopt.verify import DOT_TOLERANCE, kernel_mismatches
@@ -24,11 +25,11 @@ def one_step(scene, state, signal=0.0, dtype=float):
     groups, nodes = len(simulation.body.mass), 400
     states = np.zeros((2, mpm.STATE_SIZE * groups, 4), dtype)
     states[0] = mpm.grouped(state)
-    grids = np.zeros((1, nodes, mpm.NODE_SIZE), dtype)
+    grids = np.zeros((1, simulation.sheets, nodes, mpm.NODE_SIZE), dtype)
     windows = np.zeros((1, 2, 4), np.int64)
     logs = np.zeros((1, groups, 4), dtype)
     body, world = simulation.body, simulation.world
-    scratch = mpm.Scratch.make(nodes, 1, nodes, dtype)
+    scratch = mpm.Scratch.make(simulation.sheets, nodes, 1, nodes, dtype)
     reached, end, particle = mpm.advance(
         states,
         grids,
@@ -48,8 +49,8 @@ def one_step(scene, state, signal=0.0, dtype=float):
     # A is dropped when nodes have it; the same kernel gives it again.
     tile = mpm.make_tile(groups, states)
     mpm.stress(states[0], states[1], logs[0], body, world, simulation.signal[0], tile, 0, groups)
-    affine = mpm.ungrouped(tile.affine, 4, state.shape[1])
-    return mpm.ungrouped(states[1], *state.shape), grids[0], windows[0, 1], affine
+    affine = mpm.ungrouped(tile.affine, 4, state.shape[1]) / world.dx
+    return mpm.ungrouped(states[1], *state.shape), grids[0, 0], windows[0, 1], affine
 
 
 @pytest.fixture
@@ -74,19 +75,35 @@ def state(free, rng):
 @pytest.mark.parametrize("x", [0.5, 0.51, 0.75, 1.0, 1.3, 1.4999])
 def test_weights_interpolate_linear_fields_and_know_the_second_moment(x):
     dx = 0.1
-    w, d = mpm.weights(x), mpm.distances(x, dx)
+    w, d = mpm.weights(x), [(node - x) * dx for node in range(3)]
     assert sum(w) == pytest.approx(1.0, abs=1e-15)
     assert sum(a * b for a, b in zip(w, d, strict=True)) == pytest.approx(0.0, abs=1e-16)
     moment = sum(a * b**2 for a, b in zip(w, d, strict=True))
     assert moment == pytest.approx(dx**2 / 4, rel=1e-13)  # why C' is scaled by 4 / dx^2
 
 
-def test_weight_slopes_are_the_derivatives_of_the_weights():
-    h = 1e-30
-    for f in (0.5, 0.86, 1.44):
-        w = mpm.weights(f + 1j * h / 0.1)
-        slopes = mpm.weight_slopes(f, 0.1)
-        assert [a.imag / h for a in w] == pytest.approx(slopes, rel=1e-13)
+@pytest.mark.parametrize("t", [-0.5, -0.13, 0.0, 0.4, 0.499])
+def test_the_weights_are_quadratic_in_a_cell(t):
+    # The Taylor expansion of a field that is one at one node is the weight of that node.
+    for node in range(3):
+        value, slope, curvature = mpm.expand(*np.eye(3)[node])
+        expansion = value + t * slope + 0.5 * t**2 * curvature
+        assert expansion == pytest.approx(mpm.weights(1.0 + t)[node], abs=3e-16)
+        assert mpm.expand_adjoint(1.0, t, 0.5 * t**2)[node] == pytest.approx(expansion, abs=3e-16)
+
+
+@pytest.mark.parametrize("blend_time", [0.0, 5e-3])
+@pytest.mark.parametrize("dtype", [float, complex])
+def test_kernels_do_what_the_equations_say_node_by_node(state, blend_time, dtype):
+    scene = small_scene(blend_time=blend_time)
+    expected = state.astype(dtype)
+    particles = lay_out(scene)
+    ones = np.ones(len(particles.position), dtype)
+    signal = np.full((scene.steps, 2), 0.5)
+    simulation = Simulation(scene, particles, ones, 10.0 * ones, 7.0 * ones, signal, expected)
+    for n, found in zip(range(4), simulation.run(range(5))):
+        assert np.abs(found - expected).max() <= 1e-13 * np.abs(expected).max()
+        expected = step(simulation, expected, n)
 
 
 def test_a_step_conserves_mass_momentum_and_angular_momentum(free, state):
@@ -226,9 +243,9 @@ def test_complex_kernels_have_the_same_real_part(free, state):
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_every_adjoint_is_the_transpose_of_its_kernel(seed):
-    mismatches = kernel_mismatches(small_scene(), seed)
-    assert set(mismatches) == {
-        "deform", "stress", "p2g", "grid_update", "g2p", "design", "signal", "objective"
-    }  # fmt: skip
+@pytest.mark.parametrize("blend_time", [0.0, 5e-3])
+def test_every_adjoint_is_the_transpose_of_its_kernel(seed, blend_time):
+    mismatches = kernel_mismatches(small_scene(blend_time=blend_time), seed)
+    expected = {"deform", "stress", "p2g", "grid_update", "g2p", "design", "signal", "objective"}
+    assert set(mismatches) == expected | ({"inertia", "blend"} if blend_time else set())
     assert max(mismatches.values()) <= DOT_TOLERANCE

@@ -14,7 +14,7 @@ from mpmopt.errors import MpmoptError, SimulationError
 from mpmopt.particles import lay_out
 from mpmopt.problem import Problem
 from mpmopt.scene import Grid, Scene, Solid
-from mpmopt.simulate import Simulation, _Segment
+from mpmopt.simulate import Memory, Simulation, _Segment
 
 jit_loop = njit(nogil=True)
 
@@ -117,14 +117,14 @@ def test_windows_that_outgrow_their_room_get_what_they_need_and_change_no_bit(mo
     room = falling.room
     ends = set()
     for nodes, part in (room, (10, room[1]), (room[0], 10), (10, 10)):
-        memory = _Segment(falling, 20)
-        memory.grids = memory.grids[:, :0]
+        memory = _Segment(falling, 20, Memory())
+        memory.grids = memory.grids[:, :, :0]
         memory.resize(nodes, part)
         memory.states[0] = mpm.grouped(falling.initial)
         memory.advance(0, 20)
         ends.add(memory.states[20].tobytes())
-        assert memory.grids.shape[1] <= room[0]
-        assert memory.scratch.parts.shape[1] <= room[1]
+        assert memory.grids.shape[2] <= room[0]
+        assert memory.scratch.parts.shape[2] <= room[1]
     assert len(ends) == 1
 
 
