@@ -66,7 +66,7 @@ def test_the_folder_holds_run_summary_and_pictures(folder):
     assert json.loads((out / "summary.json").read_text()) == summary
     assert set(summary) >= {
         "start", "reference", "reference_drawn", "optimised", "post_processed", "a", "theta", "b",
-        "evaluations", "failed_evaluations", "seconds", "stop_reason",
+        "evaluations", "failed_evaluations", "redone_evaluations", "seconds", "stop_reason",
     }  # fmt: skip
     for picture in ("design.png", "history.png"):
         data = (out / picture).read_bytes()
