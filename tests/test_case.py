@@ -115,7 +115,7 @@ def test_an_interrupt_says_where_the_run_is(tmp_path, capsys, monkeypatch):
     def interrupted(self, x):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(Problem, "value_and_gradient", interrupted)
+    monkeypatch.setattr(Problem, "evaluate", interrupted)
     assert main("A case.", {"default": SMALL}, ["--out", str(tmp_path)]) == 130
     assert "run.h5 holds the run so far" in capsys.readouterr().err
 
