@@ -382,6 +382,35 @@ def find_window(state, world, first, last):
 
 
 @jit
+def margins(state, body, world, first, last):
+    """How close groups of particles come to where a step is too long, as in `simulate.Margins`.
+
+    The largest (dt / dx) sqrt(M / rho) and dt |C|, and the smallest J; M is the stiffness of a
+    particle as stretched as it is, ``lambda + mu tr b + sqrt(mu^2 (tr^2 b - 4 det b) + lambda^2)``
+    with b = F F^T. Extremes do not depend on the order in which they are taken.
+    """
+    stiffest = fastest = 0.0
+    smallest = math.inf
+    for g in range(first, last):
+        for k in range(4):
+            mass, volume = body.mass[g, k].real, body.volume[g, k].real
+            if mass > 0.0:  # else it only fills its group
+                mu, lam = body.lame_mu[g, k].real, body.lame_lambda[g, k].real
+                c00, c01 = state[12 * g + 4, k].real, state[12 * g + 5, k].real
+                c10, c11 = state[12 * g + 6, k].real, state[12 * g + 7, k].real
+                f00, f01 = state[12 * g + 8, k].real, state[12 * g + 9, k].real
+                f10, f11 = state[12 * g + 10, k].real, state[12 * g + 11, k].real
+                J = f00 * f11 - f01 * f10
+                trace = f00 * f00 + f01 * f01 + f10 * f10 + f11 * f11
+                apart = mu * mu * max(trace * trace - 4.0 * J * J, 0.0)
+                stiffness = lam + mu * trace + math.sqrt(apart + lam * lam)
+                stiffest = max(stiffest, stiffness * volume / mass)
+                fastest = max(fastest, c00 * c00 + c01 * c01 + c10 * c10 + c11 * c11)
+                smallest = min(smallest, J)
+    return world.dt / world.dx * math.sqrt(stiffest), world.dt * math.sqrt(fastest), smallest
+
+
+@jit
 def locate(state, world, part, tile, first, last):
     """The cells of the particles in the window `part` and their places in them, into the tile."""
     i0, j0, _, nj = part

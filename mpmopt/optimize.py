@@ -19,6 +19,7 @@ from mpmopt.errors import DesignError, SimulationError
 from mpmopt.mma import MovingAsymptotes
 from mpmopt.problem import Problem
 from mpmopt.scene import Scene
+from mpmopt.simulate import Margins
 
 logger = logging.getLogger(__name__)
 
@@ -51,6 +52,8 @@ class Stage:
         Design particles whose gamma is below this are not simulated (`Problem`).
     most_iterations : int, optional
         Successful evaluations of this stage, instead of `Settings.most_iterations`.
+    redo : int
+        How often an evaluation is redone with half the time step (`Problem`).
 
     Raises
     ------
@@ -67,6 +70,7 @@ class Stage:
     move_limit: float = 0.05
     leave_out: float = 0.0
     most_iterations: int | None = None
+    redo: int = 2
 
     def __post_init__(self) -> None:
         for name in ("beta", "mass_floor", "stiffness_floor", "time_step", "move_limit"):
@@ -81,6 +85,8 @@ class Stage:
             object.__setattr__(self, "most_iterations", most)
         coarsening = count("Stage", "coarsening", self.coarsening, 1, error=DesignError)
         object.__setattr__(self, "coarsening", coarsening)
+        redo = count("Stage", "redo", self.redo, 0, error=DesignError)
+        object.__setattr__(self, "redo", redo)
 
     def scene(self, scene: Scene) -> Scene:
         """The scene as this stage simulates it."""
@@ -99,7 +105,7 @@ class Stage:
     ) -> Problem:
         """The problem that this stage solves, in another time step if it ended with one."""
         stage = self if time_step is None else dataclasses.replace(self, time_step=time_step)
-        return Problem(stage.scene(scene), self.beta, checkpointing, self.leave_out)
+        return Problem(stage.scene(scene), self.beta, checkpointing, self.leave_out, self.redo)
 
 
 @dataclass(frozen=True)
@@ -179,8 +185,10 @@ class Iteration:
         Index of the start that it goes back to.
     stage : int
         Index of the stage.
-    beta, time_step, move_limit : float
+    beta, move_limit : float
         In force during the evaluation.
+    time_step : float
+        That the values are of; of the last attempt if it failed.
     x : (n,) array
         The design that was evaluated.
     gamma : (D,) array
@@ -197,6 +205,10 @@ class Iteration:
         Since the optimisation began.
     post_processed : float
         L without void, or not a number if the stage does not ask for it or it failed.
+    redone : int
+        How often the stage's time step was halved for this evaluation.
+    courant, spin, jacobian : float
+        Its `simulate.Margins`, or not a number if it failed.
     failure : str
         Why the evaluation failed, or empty.
     """
@@ -214,6 +226,10 @@ class Iteration:
     step: float
     seconds: float
     post_processed: float = np.nan
+    redone: int = 0
+    courant: float = np.nan
+    spin: float = np.nan
+    jacobian: float = np.nan
     failure: str = ""
 
 
@@ -270,6 +286,11 @@ class Optimisation:
     def failed_evaluations(self) -> int:
         """Number of evaluations that failed."""
         return sum(bool(iteration.failure) for iteration in self.history)
+
+    @property
+    def redone_evaluations(self) -> int:
+        """Number of evaluations that were redone with a shorter time step."""
+        return sum(iteration.redone > 0 for iteration in self.history)
 
 
 Callback = Callable[[Optimisation], None]
@@ -443,13 +464,21 @@ class _StageRun:
     ) -> tuple[float, NDArray[np.float64]] | None:
         """Value and gradient, recorded; None if the simulation failed."""
         run = self.run
-        value, gradient, failure = np.nan, np.full(x.size, np.nan), ""
+        value, failure = np.nan, ""
+        gradient: NDArray[np.float64] = np.full(x.size, np.nan)
+        problem, redone, margins = self.problem, self.problem.redo, Margins(*3 * (np.nan,))
+        time_step = problem.scene.time_step / 2.0**redone
         try:
-            value, gradient = self.problem.value_and_gradient(x)
+            evaluation = problem.evaluate(x)
+            value, gradient = evaluation.value, evaluation.gradient
+            redone, margins = evaluation.redone, evaluation.margins
+            time_step = evaluation.time_step
         except SimulationError as error:
             failure = str(error)
             logger.warning("evaluation %d failed: %s", len(run.history), error)
-        solid = self._without_void(x) if self.stage.solid and not failure else np.nan
+        solid = np.nan
+        if self.stage.solid and not failure:
+            solid = self._without_void(problem.at(time_step), x)
         before = run.history[-1].x if run.history else x
         if before.size != x.size:  # another grid
             before = x
@@ -459,7 +488,7 @@ class _StageRun:
             start=self.start,
             stage=self.index,
             beta=self.stage.beta,
-            time_step=self.problem.scene.time_step,
+            time_step=time_step,
             move_limit=move_limit,
             x=x.copy(),
             gamma=gamma,
@@ -469,6 +498,10 @@ class _StageRun:
             step=float(np.abs(x - before).max() / 2.0),
             seconds=time.monotonic() - self.whole.began,
             post_processed=solid,
+            redone=redone,
+            courant=margins.courant,
+            spin=margins.spin,
+            jacobian=margins.jacobian,
             failure=failure,
         )
         run.history.append(iteration)
@@ -481,9 +514,9 @@ class _StageRun:
         self.whole.report()
         return None if failure else (value, gradient)
 
-    def _without_void(self, x: NDArray[np.float64]) -> float:
+    def _without_void(self, problem: Problem, x: NDArray[np.float64]) -> float:
         try:
-            return post_processed(self.problem, x)
+            return post_processed(problem, x)
         except SimulationError as error:
             logger.warning("the design fails without void: %s", error)
             return np.nan

@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import copy
+import dataclasses
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -9,13 +14,18 @@ from numpy.typing import NDArray
 
 from mpmopt.actuation import signal, signal_adjoint
 from mpmopt.checkpoints import Checkpointing
-from mpmopt.checks import share
+from mpmopt.checks import count, share
 from mpmopt.design import DesignChain
 from mpmopt.errors import DesignError, SimulationError
 from mpmopt.objective import Objective
 from mpmopt.particles import lay_out, nearest_designed
 from mpmopt.scene import Scene
-from mpmopt.simulate import Memory, Precision, Simulation
+from mpmopt.simulate import Margins, Memory, Precision, Simulation
+
+logger = logging.getLogger(__name__)
+
+# An evaluation that goes beyond these is not trusted (docs: theory, "Step control").
+LIMITS = Margins(courant=1.0, spin=0.5, jacobian=0.01)
 
 
 class Variables(NamedTuple):
@@ -41,6 +51,31 @@ class Variables(NamedTuple):
         return cls(phi, *rest.reshape(3, -1))
 
 
+@dataclass(frozen=True)
+class Evaluation:
+    """A design evaluated, and how.
+
+    Attributes
+    ----------
+    value : float or complex
+        Objective L.
+    gradient : (D + 3 K,) array
+        Empty if only the value was asked for.
+    margins : Margins
+        Of the run that counts.
+    time_step : float
+        Of that run.
+    redone : int
+        How often the step was halved to get there.
+    """
+
+    value: Any
+    gradient: NDArray[np.float64]
+    margins: Margins
+    time_step: float
+    redone: int = 0
+
+
 class Problem:
     """How far a design travels in a scene, and which way to change it.
 
@@ -56,6 +91,9 @@ class Problem:
         Design particles whose gamma is below this are not simulated. Their void weighs nothing
         then, cannot be flung about, and costs no time; they return when the filter brings them
         back. The objective jumps where gamma crosses this; its gradient is that between jumps.
+    redo : int, optional
+        How often an evaluation that fails or comes too close to it, over `LIMITS`, is redone with
+        half the time step; then it is a SimulationError. 0: never, and no limit counts.
     precision : {"double", "single"}, optional
         Of the simulation (`Simulation`).
 
@@ -69,7 +107,7 @@ class Problem:
     Raises
     ------
     DesignError
-        If beta or `leave_out` makes no sense.
+        If beta, `leave_out` or `redo` makes no sense.
     """
 
     def __init__(
@@ -78,12 +116,14 @@ class Problem:
         beta: float = 1.0,
         checkpointing: Checkpointing | None = None,
         leave_out: float = 0.0,
+        redo: int = 2,
         precision: Precision = "double",
     ) -> None:
         self.scene = scene
         self.precision: Precision = precision
         self._memories: list[Memory] = []
         self.leave_out = share("Problem", "leave_out", leave_out, error=DesignError)
+        self.redo = count("Problem", "redo", redo, 0, error=DesignError)
         self.checkpointing = checkpointing or Checkpointing()
         self.particles = lay_out(scene)
         self.chain = DesignChain(scene, self.particles, beta)
@@ -164,6 +204,18 @@ class Problem:
         """How far the body of one of this problem's simulations goes."""
         return Objective.of(simulation.particles, self.scene.direction)
 
+    def at(self, time_step: float) -> Problem:
+        """The same problem in another time step.
+
+        Raises
+        ------
+        SceneError
+            If the scene cannot be simulated with it.
+        """
+        other = copy.copy(self)
+        other.scene = self.scene.vary(time_step=time_step)
+        return other
+
     def value(self, x: NDArray) -> Any:
         """Objective L of a design, larger is farther; complex if x is complex.
 
@@ -172,13 +224,23 @@ class Problem:
         DesignError
             If x does not fit.
         SimulationError
-            If the simulation fails.
+            If the simulation fails, or comes too close to it, in all time steps that are tried.
         """
-        simulation = self.simulation(x)
-        return _finite(self.objective(simulation).value(simulation.run()), simulation)
+        return self._redo(lambda problem: problem._value(x)).value
 
     def value_and_gradient(self, x: NDArray) -> tuple[float, NDArray[np.float64]]:
         """Objective L and its gradient (D + 3 K,), by the reverse loop.
+
+        Raises
+        ------
+        DesignError, SimulationError, StorageError
+            As `evaluate`.
+        """
+        evaluation = self.evaluate(x)
+        return evaluation.value, evaluation.gradient
+
+    def evaluate(self, x: NDArray) -> Evaluation:
+        """Objective and gradient, and the time step that they are of.
 
         Raises
         ------
@@ -187,11 +249,36 @@ class Problem:
         StorageError
             If checkpoints cannot be stored or read back.
         """
-        phi, a, theta, _ = self.split(_real("x", x))
+        x = _real("x", x)
+        return self._redo(lambda problem: problem._value_and_gradient(x))
+
+    def _redo(self, evaluate: Callable[[Problem], Evaluation]) -> Evaluation:
+        """An evaluation of this problem, or of one with a step that is short enough for it."""
+        problem = self
+        for redone in range(self.redo + 1):
+            try:
+                return dataclasses.replace(evaluate(problem), redone=redone)
+            except SimulationError as error:
+                if redone == self.redo:
+                    raise
+                logger.info("redone with half of time step %g: %s", problem.scene.time_step, error)
+            problem = problem.at(problem.scene.time_step / 2.0)
+        raise AssertionError("not reached")
+
+    def _value(self, x: NDArray) -> Evaluation:
+        simulation = self.simulation(x)
+        state, margins = simulation.watch()
+        self._check(margins, simulation)
+        value = _finite(self.objective(simulation).value(state), simulation)
+        return Evaluation(value, np.empty(0), margins, self.scene.time_step)
+
+    def _value_and_gradient(self, x: NDArray[np.float64]) -> Evaluation:
+        phi, a, theta, _ = self.split(x)
         simulation = self.simulation(x)
         memory = self._memories.pop() if self._memories else Memory()
         with simulation.checkpoints(self.checkpointing) as checkpoints:
             forward = simulation.forward(checkpoints, memory)
+            self._check(forward.margins, simulation)
             objective = self.objective(simulation)
             value = float(_finite(objective.value(forward.state), simulation))
             gradient = forward.reverse(objective.seed(forward.state))
@@ -200,7 +287,20 @@ class Problem:
         bars[:, self.present(phi)] = gradient.density, gradient.lame_lambda, gradient.lame_mu
         phi_bar = self.chain.pullback(phi, *bars)
         parts = phi_bar, *signal_adjoint(self.scene, a, theta, gradient.signal)
-        return value, _finite(np.concatenate(parts), simulation)
+        whole = _finite(np.concatenate(parts), simulation)
+        return Evaluation(value, whole, forward.margins, self.scene.time_step)
+
+    def _check(self, margins: Margins, simulation: Simulation) -> None:
+        """A run that came too close to failure is a SimulationError, unless nothing is redone."""
+        if self.redo == 0:
+            return
+        for what, value, limit in (
+            ("the Courant number of a stretched particle", margins.courant, LIMITS.courant),
+            ("dt |C| of a particle", margins.spin, LIMITS.spin),
+            ("1 / J of a particle", 1.0 / margins.jacobian, 1.0 / LIMITS.jacobian),
+        ):
+            if not value <= limit:
+                raise _too_long(simulation, f"{what} reached {value:.3g}, the limit is {limit:.3g}")
 
 
 def _real(name: str, value: Any) -> NDArray[np.float64]:
@@ -212,11 +312,14 @@ def _real(name: str, value: Any) -> NDArray[np.float64]:
 
 def _finite(values: Any, simulation: Simulation) -> Any:
     if not np.all(np.isfinite(values)):
-        raise SimulationError(
+        raise _too_long(
+            simulation,
             f"{np.sum(~np.isfinite(values))} of {np.size(values)} results are not finite",
-            simulation.steps,
-            -1,
-            (np.nan, np.nan),
-            f"take a smaller time step (now {simulation.scene.time_step:g})",
         )
     return values
+
+
+def _too_long(simulation: Simulation, what: str) -> SimulationError:
+    """What the step is too long for, as an error about the whole body."""
+    hint = f"take a smaller time step (now {simulation.scene.time_step:g})"
+    return SimulationError(what, simulation.steps, -1, (np.nan, np.nan), hint)

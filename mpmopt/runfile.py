@@ -1,6 +1,6 @@
 """The one file that a run leaves: scene, settings, versions, history and designs, in HDF5.
 
-Layout (version 1)::
+Layout (version 2)::
 
     attributes       format, version, stop_reason; as JSON: scene, settings, versions, summary
     history/NAME     one entry per evaluation: objective, beta, greyness, step, ...
@@ -31,7 +31,7 @@ from mpmopt.optimize import Iteration, Optimisation, Settings, Stage
 from mpmopt.problem import Problem, Variables
 from mpmopt.scene import Scene
 
-FORMAT, VERSION = "mpmopt run", 1
+FORMAT, VERSION = "mpmopt run", 2
 COLUMNS = tuple(f.name for f in dataclasses.fields(Iteration) if f.type in ("int", "float"))
 
 

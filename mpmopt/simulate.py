@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -26,6 +26,8 @@ WORK_PER_CALL = 500_000
 # Particles in a block, at least, and blocks, at most. They, and with them the order in which nodes
 # are summed, do not depend on the number of threads.
 BLOCK, BLOCKS = 400, 64
+# States are looked at for their margins once in so many steps, and at the end.
+WATCH = 16
 
 
 def world_of(scene: Scene) -> mpm.World:
@@ -57,6 +59,35 @@ def world_of(scene: Scene) -> mpm.World:
         mirror_node=0 if scene.mirror is None else round(scene.mirror.position / dx),
         keep=math.exp(-scene.time_step / scene.blend_time) if scene.blend_time else 0.0,
     )
+
+
+class Margins(NamedTuple):
+    """How close a run came to where its step is too long: extremes over particles and steps.
+
+    States 0, 16, 32, ... and the last one are looked at. Real parts count.
+
+    Attributes
+    ----------
+    courant : float
+        Largest (dt / dx) sqrt(M / rho) with the stiffness M of the stretched particle. An isolated
+        particle is unstable above 1.
+    spin : float
+        Largest dt |C|, the Frobenius norm. Below 1 no particle can be inverted by a step.
+    jacobian : float
+        Smallest J = det F.
+    """
+
+    courant: float = 0.0
+    spin: float = 0.0
+    jacobian: float = math.inf
+
+    def join(self, other: Margins) -> Margins:
+        """The margins of two runs, or of two parts of a run, taken together."""
+        return Margins(
+            max(self.courant, other.courant),
+            max(self.spin, other.spin),
+            min(self.jacobian, other.jacobian),
+        )
 
 
 @dataclass(frozen=True)
@@ -194,6 +225,30 @@ class Simulation:
             kept.append(mpm.ungrouped(states[0], *self.initial.shape))
         return kept[-1] if frames is None else np.array(kept)
 
+    def watch(self) -> tuple[NDArray, Margins]:
+        """Run forward and keep nothing: the final state (12, N), and how close the run came.
+
+        Raises
+        ------
+        SimulationError
+            As `run`.
+        """
+        memory = _Segment(self, 1, Memory())
+        memory.states[0] = mpm.grouped(self.initial)
+        margins = Margins()
+        for first in range(0, self.steps, WATCH):
+            margins = margins.join(self.margins(memory.states[0]))
+            last = min(first + WATCH, self.steps)
+            memory.advance(first, last)
+            memory.states[0] = memory.states[(last - first) % 2]
+        margins = margins.join(self.margins(memory.states[0]))
+        return mpm.ungrouped(memory.states[0], *self.initial.shape), margins
+
+    def margins(self, records: NDArray) -> Margins:
+        """Those of a state, as records of groups of particles (`mpm.grouped`)."""
+        found = mpm.margins(records, self.body, self.world, 0, len(self.body.mass))
+        return Margins(*(float(value) for value in found))
+
     @property
     def sheets(self) -> int:
         """Sheets of nodes: two where particles keep a share of their own velocity, else one."""
@@ -274,16 +329,20 @@ class Simulation:
         schedule = checkpoints.schedule
         segment = _Segment(self, schedule.segment, memory or Memory())
         segment.states[0] = mpm.grouped(self.initial)
+        margins = Margins()
         for index, (first, last) in enumerate(schedule.segments):
             if not schedule.all_stored:
                 state = mpm.ungrouped(segment.states[0], *self.initial.shape)
                 checkpoints.write(index, state=state)
             segment.advance(first, last)
+            for slot in range(-first % WATCH, last - first, WATCH):
+                margins = margins.join(self.margins(segment.states[slot]))
             if last < schedule.steps:
                 if schedule.all_stored:
                     segment.store(index, checkpoints)
                 segment.states[0] = segment.states[last - first]
-        return Forward(self, checkpoints, segment)
+        margins = margins.join(self.margins(segment.states[last - first]))
+        return Forward(self, checkpoints, segment, margins)
 
 
 class Memory:
@@ -398,9 +457,17 @@ class Forward:
     ----------
     state : (12, N) array
         The final state.
+    margins : Margins
     """
 
-    def __init__(self, simulation: Simulation, checkpoints: Checkpoints, memory: _Segment) -> None:
+    def __init__(
+        self,
+        simulation: Simulation,
+        checkpoints: Checkpoints,
+        memory: _Segment,
+        margins: Margins,
+    ) -> None:
+        self.margins = margins
         self._simulation, self._checkpoints, self._memory = simulation, checkpoints, memory
         self._reversed = False
         first, last = checkpoints.schedule.segments[-1]

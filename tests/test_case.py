@@ -66,7 +66,7 @@ def test_the_folder_holds_run_summary_and_pictures(folder):
     assert json.loads((out / "summary.json").read_text()) == summary
     assert set(summary) >= {
         "start", "reference", "reference_drawn", "optimised", "post_processed", "a", "theta", "b",
-        "evaluations", "failed_evaluations", "seconds", "stop_reason",
+        "evaluations", "failed_evaluations", "redone_evaluations", "seconds", "stop_reason",
     }  # fmt: skip
     for picture in ("design.png", "history.png"):
         data = (out / picture).read_bytes()
@@ -115,7 +115,7 @@ def test_an_interrupt_says_where_the_run_is(tmp_path, capsys, monkeypatch):
     def interrupted(self, x):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(Problem, "value_and_gradient", interrupted)
+    monkeypatch.setattr(Problem, "evaluate", interrupted)
     assert main("A case.", {"default": SMALL}, ["--out", str(tmp_path)]) == 130
     assert "run.h5 holds the run so far" in capsys.readouterr().err
 

@@ -28,15 +28,15 @@ def start(scene):
 def fail_on(monkeypatch, numbers):
     """Let the evaluations of these numbers fail, and count all."""
     calls = []
-    real = Problem.value_and_gradient
+    real = Problem.evaluate
 
-    def value_and_gradient(self, x):
+    def evaluate(self, x):
         calls.append((self.scene.time_step, x.copy()))
         if len(calls) - 1 in numbers:
             raise SimulationError("made to fail", 3, 1, (0.0, 0.0), "none")
         return real(self, x)
 
-    monkeypatch.setattr(Problem, "value_and_gradient", value_and_gradient)
+    monkeypatch.setattr(Problem, "evaluate", evaluate)
     return calls
 
 
