@@ -202,7 +202,7 @@ def test_kernels_that_were_edited_are_never_taken_from_the_cache(tmp_path, monke
     (before,) = start_up(tmp_path, FALL, tmp_path)
     kernels = tmp_path / "mpmopt" / "mpm.py"
     text = kernels.read_text()
-    gravity = "grid[node, 0] / m + world.dt * world.gravity_x\n"
+    gravity = "grid[0, node, 0] * per_m + world.dt * world.gravity_x\n"
     assert text.count(gravity) == 1
     kernels.write_text(text.replace(gravity, gravity.replace("world.dt *", "2.0 * world.dt *")))
     (after,) = start_up(tmp_path, FALL, tmp_path)
