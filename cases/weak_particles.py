@@ -40,14 +40,15 @@ CASES = {
     "crawler": (crawler.crawler, crawler.slanted_legs),
 }
 BETAS = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
+LEAVE_OUT = 0.05  # gamma below which void is left out
 STEP_IN_CELLS = 0.1024  # seconds per unit of dx: Courant number 0.56
 
 
 class Void(NamedTuple):
-    """How much of void is simulated."""
+    """How much of void is simulated, and from which beta on it is left out."""
 
     mass_floor: float
-    leave_out: float = 0.0
+    left_out_from: float = np.inf
     stiffness_floor: float = 1e-3
 
     def of(self, scene: Scene) -> Scene:
@@ -59,8 +60,8 @@ VOIDS = {
     "mass 1e-3 (the paper's)": Void(1e-3),
     "mass 1e-2": Void(1e-2),
     "mass 3e-2": Void(3e-2),
-    "mass 1e-3, void left out": Void(1e-3, 0.05),
-    "mass 1e-2, void left out": Void(1e-2, 0.05),
+    "mass 1e-2, left out": Void(1e-2, 0.0),
+    "mass 1e-2, left out from beta 8": Void(1e-2, 8.0),
 }
 
 
@@ -90,7 +91,7 @@ def short_optimisation(scene: Scene, void: Void, iterations: int) -> Optimisatio
             void.stiffness_floor,
             scene.time_step,
             solid=beta >= 16.0,
-            leave_out=void.leave_out,
+            leave_out=LEAVE_OUT if beta >= void.left_out_from else 0.0,
         )
         for beta in BETAS
     )
@@ -103,14 +104,14 @@ def short_optimisation(scene: Scene, void: Void, iterations: int) -> Optimisatio
 def distance_with_void(
     scene: Scene, keep: NDArray[np.bool_], variables: Variables, void: Void
 ) -> float:
-    """Objective L of a binary design (D,) whose void is there, unless it is left out.
+    """Objective L of a binary design (D,) whose void is there, unless late stages leave it out.
 
     Raises
     ------
     DesignError, SimulationError
         As the simulation does.
     """
-    if void.leave_out > 0.0:
+    if np.isfinite(void.left_out_from):
         return distance(scene, keep, variables)
     scene = void.of(scene)
     particles = lay_out(scene)
