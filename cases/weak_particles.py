@@ -123,15 +123,23 @@ def distance_with_void(
     return float(Objective.of(particles, scene.direction).value(simulation.run()))
 
 
-def moved(scene: Scene, keep: NDArray[np.bool_], variables: Variables, void: Void) -> str:
-    """By how much of its gain over the full block void moves a binary design, or why not."""
+def moved(scene: Scene, keep: NDArray[np.bool_], variables: Variables) -> list[str]:
+    """By how much of its gain over the full block each void moves a binary design, or why not."""
     try:
         removed = distance(scene, keep, variables)
         gain = removed - distance(scene, full_block(keep), variables)
-        change = distance_with_void(scene, keep, variables, void) - removed
-    except SimulationError as error:
-        return f"failed at step {error.step}"
-    return f"{100.0 * change / gain:.1f}" if gain > 0.0 else "no gain"
+    except SimulationError:
+        return ["fails without void"] * len(VOIDS)
+    if gain <= 0.0:
+        return ["no gain"] * len(VOIDS)
+    changes = []
+    for void in VOIDS.values():
+        try:
+            change = distance_with_void(scene, keep, variables, void) - removed
+            changes.append(f"{100.0 * change / gain:.1f}")
+        except SimulationError as error:
+            changes.append(f"failed at step {error.step}")
+    return changes
 
 
 def start_actuation() -> Variables:
@@ -151,8 +159,12 @@ def rows_of(name: str, cells: int, iterations: int) -> Iterator[Row]:
         seconds[label] = time.process_time() - began
         print(f"{name}, {label}: {runs[label].failed_evaluations} failed", file=sys.stderr)
     best = runs[label].result  # the last one's, whose void is left out: as binary as they come
-    for label, void in VOIDS.items():
-        run = runs[label]
+    changes = [
+        moved(there, keep, variables)
+        for there in (scene, refined(scene))
+        for keep, variables in designs(there, scene, drawing, best.x, best.gamma)
+    ]
+    for index, (label, run) in enumerate(runs.items()):
         yield Row(
             name,
             label,
@@ -162,11 +174,7 @@ def rows_of(name: str, cells: int, iterations: int) -> Iterator[Row]:
             f"{run.result.objective:.3f}",
             solid_distance(run),
             f"{1e3 * seconds[label] / len(run.history):.0f}",
-            *(
-                moved(there, keep, variables, void)
-                for there in (scene, refined(scene))
-                for keep, variables in designs(there, scene, drawing, best.x, best.gamma)
-            ),
+            *(change[index] for change in changes),
         )
 
 
