@@ -92,6 +92,7 @@ def short_optimisation(scene: Scene, void: Void, iterations: int) -> Optimisatio
             scene.time_step,
             solid=beta >= 16.0,
             leave_out=LEAVE_OUT if beta >= void.left_out_from else 0.0,
+            redo=0,  # what fails shall count
         )
         for beta in BETAS
     )
