@@ -1,0 +1,232 @@
+"""Void beside stressed solid: which floors let a robot be designed with a long step.
+
+    python cases/weak_particles.py --out DIR [--quick]
+
+Optimises walker and crawler at Courant number 0.56 with several kinds of void, counts the
+evaluations that fail, and measures by how much the void moves a binary design. Writes
+``weak_particles.csv`` and ``weak_particles.rst``.
+"""
+
+import argparse
+import csv
+import io
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import crawler
+import numpy as np
+import walker
+from numpy.typing import NDArray
+
+from mpmopt import runfile
+from mpmopt.actuation import signal
+from mpmopt.audit import refined
+from mpmopt.binary import THRESHOLD, Drawing, distance, full_block, post_processed
+from mpmopt.case import START
+from mpmopt.design import interpolate
+from mpmopt.errors import MpmoptError, SimulationError
+from mpmopt.objective import Objective
+from mpmopt.optimize import Optimisation, Settings, Stage, optimise
+from mpmopt.particles import lay_out, nearest_designed
+from mpmopt.problem import Problem, Variables
+from mpmopt.scene import Scene
+from mpmopt.simulate import Simulation
+
+CASES = {
+    "walker": (walker.walker, walker.slanted_legs),
+    "crawler": (crawler.crawler, crawler.slanted_legs),
+}
+BETAS = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
+LEAVE_OUT = 0.05  # gamma below which void is left out
+STEP_IN_CELLS = 0.1024  # seconds per unit of dx: Courant number 0.56
+
+
+class Void(NamedTuple):
+    """How much of void is simulated, and from which beta on it is left out."""
+
+    mass_floor: float
+    left_out_from: float = np.inf
+    stiffness_floor: float = 1e-3
+
+    def of(self, scene: Scene) -> Scene:
+        """The scene with these floors."""
+        return scene.vary(mass_floor=self.mass_floor, stiffness_floor=self.stiffness_floor)
+
+
+VOIDS = {
+    "mass 1e-3 (the paper's)": Void(1e-3),
+    "mass 1e-2": Void(1e-2),
+    "mass 3e-2": Void(3e-2),
+    "mass 1e-2, left out": Void(1e-2, 0.0),
+    "mass 1e-2, left out from beta 8": Void(1e-2, 8.0),
+}
+
+
+class Row(NamedTuple):
+    """One line of the table; distances moved are in percent of the gain over the full block."""
+
+    case: str
+    void: str
+    evaluations: int
+    failed: int
+    smallest_step: float
+    optimised: str
+    post_processed: str
+    cpu_ms_per_evaluation: str
+    moved_drawn: str
+    moved_optimised: str
+    moved_drawn_fine: str
+    moved_optimised_fine: str
+
+
+def short_optimisation(scene: Scene, void: Void, iterations: int) -> Optimisation:
+    """Beta doubled from 0.5 to 32 at the scene's own step, so many evaluations each."""
+    stages = tuple(
+        Stage(
+            beta,
+            void.mass_floor,
+            void.stiffness_floor,
+            scene.time_step,
+            solid=beta >= 16.0,
+            leave_out=LEAVE_OUT if beta >= void.left_out_from else 0.0,
+            redo=0,  # what fails shall count
+        )
+        for beta in BETAS
+    )
+    settings = Settings(
+        stages, least_iterations=iterations, most_iterations=iterations, tolerance=0.0
+    )
+    return optimise(scene, settings, Problem(stages[0].scene(scene)).join(**START))
+
+
+def distance_with_void(
+    scene: Scene, keep: NDArray[np.bool_], variables: Variables, void: Void
+) -> float:
+    """Objective L of a binary design (D,) whose void is there, unless late stages leave it out.
+
+    Raises
+    ------
+    DesignError, SimulationError
+        As the simulation does.
+    """
+    if np.isfinite(void.left_out_from):
+        return distance(scene, keep, variables)
+    scene = void.of(scene)
+    particles = lay_out(scene)
+    gamma = np.ones(particles.designed.size)
+    gamma[particles.designed] = keep
+    material = interpolate(scene.material, gamma)
+    driven = signal(scene, variables.a, variables.theta, variables.b)
+    simulation = Simulation(scene, particles, *material, driven)
+    return float(Objective.of(particles, scene.direction).value(simulation.run()))
+
+
+def moved(scene: Scene, keep: NDArray[np.bool_], variables: Variables) -> list[str]:
+    """By how much of its gain over the full block each void moves a binary design, or why not."""
+    try:
+        removed = distance(scene, keep, variables)
+        gain = removed - distance(scene, full_block(keep), variables)
+    except SimulationError:
+        return ["fails without void"] * len(VOIDS)
+    if gain <= 0.0:
+        return ["no gain"] * len(VOIDS)
+    changes = []
+    for void in VOIDS.values():
+        try:
+            change = distance_with_void(scene, keep, variables, void) - removed
+            changes.append(f"{100.0 * change / gain:.1f}")
+        except SimulationError as error:
+            changes.append(f"failed at step {error.step}")
+    return changes
+
+
+def start_actuation() -> Variables:
+    """The signal that optimisations start from."""
+    a, theta, b = (np.array([START[name]]) for name in ("a", "theta", "b"))
+    return Variables(np.empty(0), a, theta, b)
+
+
+def rows_of(name: str, cells: int, iterations: int) -> Iterator[Row]:
+    """The lines of one case, on so many cells and on twice as many."""
+    make, drawing = CASES[name]
+    scene = make(cells, STEP_IN_CELLS / cells)
+    runs, seconds = {}, {}
+    for label, void in VOIDS.items():
+        began = time.process_time()
+        runs[label] = short_optimisation(scene, void, iterations)
+        seconds[label] = time.process_time() - began
+        print(f"{name}, {label}: {runs[label].failed_evaluations} failed", file=sys.stderr)
+    best = runs[label].result  # the last one's, whose void is left out: as binary as they come
+    changes = [
+        moved(there, keep, variables)
+        for there in (scene, refined(scene))
+        for keep, variables in designs(there, scene, drawing, best.x, best.gamma)
+    ]
+    for index, (label, run) in enumerate(runs.items()):
+        yield Row(
+            name,
+            label,
+            len(run.history),
+            run.failed_evaluations,
+            min(item.time_step for item in run.history),
+            f"{run.result.objective:.3f}",
+            solid_distance(run),
+            f"{1e3 * seconds[label] / len(run.history):.0f}",
+            *(change[index] for change in changes),
+        )
+
+
+def solid_distance(run: Optimisation) -> str:
+    """Distance of the result without its void, or that it fails."""
+    try:
+        return f"{post_processed(run.problem(), run.result.x):.3f}"
+    except SimulationError:
+        return "failed"
+
+
+def designs(
+    scene: Scene,
+    designed_in: Scene,
+    drawing: Drawing,
+    x: NDArray[np.float64],
+    gamma: NDArray[np.float64],
+) -> list[tuple[NDArray[np.bool_], Variables]]:
+    """The drawn binary design and the optimised one, with their actuation, on a scene's grid."""
+    particles = lay_out(scene)
+    drawn = drawing(particles.position[particles.designed])
+    solid = (gamma >= THRESHOLD)[nearest_designed(particles, lay_out(designed_in))]
+    return [(drawn, start_actuation()), (solid, Variables.of(x, gamma.size))]
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Measure, print and write the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of results")
+    parser.add_argument("--quick", action="store_true", help="half as many cells along each side")
+    parser.add_argument("--iterations", type=int, default=10, help="evaluations per beta (10)")
+    arguments = parser.parse_args(argv)
+    cells = 64 if arguments.quick else 128
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(Row._fields)
+    try:
+        arguments.out.mkdir(parents=True, exist_ok=True)
+        for name in CASES:
+            writer.writerows(rows_of(name, cells, arguments.iterations))
+        runfile.replace_file(arguments.out / "weak_particles.csv", text.getvalue().encode())
+    except MpmoptError as error:
+        print(f"{type(error).__name__}: {error}", file=sys.stderr)
+        return 1
+    lines = text.getvalue().replace("_", " ").splitlines()
+    table = [f".. csv-table:: Void at Courant number 0.56, {cells} x {cells} cells",
+             "   :header-rows: 1", "", *(f"   {line}" for line in lines)]  # fmt: skip
+    (arguments.out / "weak_particles.rst").write_text("\n".join(table) + "\n")
+    print("\n".join(table))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
