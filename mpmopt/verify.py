@@ -97,22 +97,20 @@ def kernel_mismatches(scene: Scene, seed: int = 0) -> dict[str, float]:
         ),
         "p2g": (bench.p2g, bench.p2g_adjoint, "position velocity affine mass"),
         "grid_update": (bench.grid_update, bench.grid_update_adjoint, "grid"),
-        "g2p": (bench.g2p, bench.g2p_adjoint, "position node_velocity"),
+        "g2p": (
+            bench.g2p,
+            bench.g2p_adjoint,
+            "position node_velocity" + " velocity" * (bench.sheets == 2),
+        ),
     }
+    if bench.sheets == 2:
+        tests["inertia"] = bench.inertia, bench.inertia_adjoint, "affine_velocity mass"
     result = {
         name: dot_product_mismatch(
             function, adjoint, {key: bench.inputs[key] for key in keys.split()}, rng
         )
         for name, (function, adjoint, keys) in tests.items()
     }
-    if scene.blend_time:
-        tests = {
-            "inertia": (bench.inertia, bench.inertia_adjoint, "affine_velocity mass"),
-            "blend": (bench.blend, bench.blend_adjoint, "position velocity node_velocity"),
-        }
-        for name, (function, adjoint, keys) in tests.items():
-            inputs = {key: bench.inputs[key] for key in keys.split()}
-            result[name] = dot_product_mismatch(function, adjoint, inputs, rng)
     if scene.mirror is not None:
         grid = {"grid": rng.standard_normal((bench.nodes, 3))}
         result["mirror"] = dot_product_mismatch(
@@ -194,7 +192,7 @@ class _Bench:
             },
             "signal": np.full(len(scene.actuators), 0.7),
             "affine": affine,
-            "node_velocity": speed * rng.standard_normal((self.nodes, 2)),
+            "node_velocity": speed * rng.standard_normal((self.sheets, self.nodes, 2)),
         }
         grid = self.p2g(self.inputs)["grid"]
         self.mass_grid = grid[:, 2]
@@ -364,42 +362,34 @@ class _Bench:
         return {"grid": scratch.node_bar[:, self.mass_grid > 0.0, :3]}
 
     def g2p(self, v: Arrays) -> Arrays:
+        """With the blend, if the scene has one."""
         old, cells = self._before_g2p(v)
-        new = np.zeros_like(old)
-        mpm.g2p(old, new, self.world, self._tile(old), cells, *self.all)
+        new, tile = np.zeros_like(old), self._tile(old)
+        mpm.g2p(old, new, self.world, tile, cells[0], *self.all)
+        if self.sheets == 2:
+            mpm.blend(old, new, self.world, tile, cells[1], *self.all)
         return {"new": self._particles(new, 12)[0:8]}
 
-    def _before_g2p(self, v: Arrays) -> tuple[NDArray, NDArray]:
+    def _before_g2p(self, v: Arrays) -> tuple[NDArray, list[NDArray]]:
         dtype = np.result_type(*v.values()).type
-        return self._state(v, dtype), self._cells(v["node_velocity"].astype(dtype).ravel())
+        fields = v["node_velocity"].astype(dtype).reshape(self.sheets, -1)
+        return self._state(v, dtype), [self._cells(field) for field in fields]
 
     def g2p_adjoint(self, v: Arrays, w: Arrays) -> Arrays:
         old, cells = self._before_g2p(v)
-        bar, cells_bar = self._bar(0, w["new"]), np.zeros_like(cells)
-        # What stays of v_bar' is the blend's.
-        world = self.world._replace(keep=0.0)
-        mpm.g2p_adjoint(world, self._tile(old), cells, cells_bar, bar, *self.all)
-        return {
-            "position": self._particles(bar, 12)[0:2],
-            "node_velocity": self._nodes(cells_bar).reshape(-1, 2),
-        }
-
-    def blend(self, v: Arrays) -> Arrays:
-        old, cells = self._before_g2p(v)
-        new = np.zeros_like(old)
-        mpm.blend(old, new, self.world, self._tile(old), cells, *self.all)
-        return {"new": self._particles(new, 12)[2:4]}
-
-    def blend_adjoint(self, v: Arrays, w: Arrays) -> Arrays:
-        old, cells = self._before_g2p(v)
-        bar, cells_bar = self._bar(2, self.world.keep * w["new"]), np.zeros_like(cells)
-        mpm.blend_adjoint(self.world, self._tile(old), cells, cells_bar, bar, *self.all)
+        bar, tile = self._bar(0, w["new"]), self._tile(old)
+        cells_bar = [np.zeros_like(each) for each in cells]
+        mpm.g2p_adjoint(self.world, tile, cells[0], cells_bar[0], bar, *self.all)
+        if self.sheets == 2:
+            mpm.blend_adjoint(self.world, tile, cells[1], cells_bar[1], bar, *self.all)
         bar = self._particles(bar, 12)
-        return {
+        node_velocity = np.stack([self._nodes(each) for each in cells_bar])
+        result = {
             "position": bar[0:2],
             "velocity": bar[2:4],
-            "node_velocity": self._nodes(cells_bar).reshape(-1, 2),
+            "node_velocity": node_velocity.reshape(self.sheets, -1, 2),
         }
+        return {name: result[name] for name in v}
 
 
 def _log_jacobian(records: NDArray) -> NDArray:
