@@ -72,11 +72,12 @@ class Discretisation:
         SceneError
             If that is no whole number of cells.
         """
-        cells = tuple(round(multiple * n) for n in scene.grid.cells)
-        if any(here != multiple * n for here, n in zip(cells, scene.grid.cells)):
+        nx, ny = (multiple * n for n in scene.grid.cells)
+        if nx != round(nx) or ny != round(ny):
             raise SceneError(f"{multiple:g} times {scene.grid.cells} cells is no whole number")
         courant = scene.courant if courant is None else courant
         steps = scene.duration * scene.material.wave_speed * multiple / scene.grid.dx / courant
+        cells = round(nx), round(ny)
         own = cls(cells, math.ceil(steps - 1e-6), scene.particles_per_cell, mirror=scene.mirror)
         return replace(own, **changes)
 
