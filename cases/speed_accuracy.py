@@ -484,7 +484,7 @@ def draw(path: Path, points: Sequence[Point], known: dict[str, tuple[float, floa
         plt.Rectangle((0, 0), 1, 1, color="#e8e8e8", label="less than the reference knows"),
     ]
     figure.legend(handles=handles, loc="lower center", ncols=6, frameon=False)
-    figure.subplots_adjust(0.06, 0.13, 0.985, 0.95, wspace=0.24, hspace=0.3)
+    figure.subplots_adjust(0.06, 0.1, 0.985, 0.97, wspace=0.24, hspace=0.22)
     figure.savefig(path, dpi=110)
     plt.close(figure)
 
@@ -533,12 +533,14 @@ def _scatter(
                     arrowprops={"arrowstyle": "-", "color": "crimson", "lw": 0.8, "shrinkB": 7},
                     bbox={"fc": "white", "ec": "none", "alpha": 0.8, "pad": 1}, zorder=6,
                 )  # fmt: skip
-    for axis, text in ((ax.xaxis, "{:g} s"), (ax.yaxis, "{:.3g} %")):
-        scale = 1.0 if axis is ax.xaxis else 100.0
-        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=20))
-        axis.set_major_formatter(lambda v, _, text=text, scale=scale: text.format(scale * v))
+    low, high = ax.get_ylim()
+    subs = (1.0, 2.0, 5.0) if high > 10.0 * low else (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0)
+    ax.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0), numticks=20))
+    ax.yaxis.set_major_locator(LogLocator(subs=subs, numticks=20))
+    ax.xaxis.set_major_formatter(lambda seconds, _: f"{seconds:g} s")
+    ax.yaxis.set_major_formatter(lambda share, _: f"{100.0 * share:.3g} %")
+    for axis in (ax.xaxis, ax.yaxis):
         axis.set_minor_formatter(NullFormatter())
-    ax.tick_params(axis="x", labelrotation=45)
     ax.grid(True, which="major", alpha=0.3)
 
 
