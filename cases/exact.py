@@ -12,14 +12,14 @@ from mpmopt.scene import Grid, Material, Mirror, Scene, Solid
 from mpmopt.simulate import Simulation, world_of
 
 
-def solid_simulation(scene, particles=None, state=None, **options):
+def solid_simulation(scene, particles=None, state=None, precision="double"):
     particles = particles or lay_out(scene)
     ones = np.ones(len(particles.position))
     material = scene.material
     signal = np.zeros((scene.steps, len(scene.actuators)))
     return Simulation(
         scene, particles, material.density * ones, material.lame_lambda * ones,
-        material.lame_mu * ones, signal, state, **options,
+        material.lame_mu * ones, signal, state, precision,
     )  # fmt: skip
 
 
@@ -48,8 +48,7 @@ class Bar:
     checkpointing : Checkpointing, optional
     blend_time : float, optional
         As in `Scene`.
-    options
-        Of the `Simulation`.
+    precision : {"double", "single"}, optional
     """
 
     length = 25.0
@@ -57,7 +56,9 @@ class Bar:
     amplitude = 1e-2
     duration = 11.25  # periods: one and an eighth
 
-    def __init__(self, n, courant, per_cell=2, checkpointing=None, blend_time=0.0, **options):
+    def __init__(
+        self, n, courant, per_cell=2, checkpointing=None, blend_time=0.0, precision="double"
+    ):
         dx = self.length / n
         free, held = 4 * dx, 4 * dx + self.length
         steps = math.ceil(self.duration * self.speed / dx / courant - 1e-6)
@@ -66,7 +67,7 @@ class Bar:
             material=Material(lame_lambda=0.0, lame_mu=self.speed**2 / 2.0),
             body=(Solid((free, 4 * dx), (held + self.length, 6 * dx)),),
             particles_per_cell=per_cell, mirror=Mirror("x", held), direction=(0.0, 1.0),
-            **({"blend_time": blend_time} if blend_time else {}),
+            blend_time=blend_time,
         )  # fmt: skip
         particles = lay_out(scene)
         beta = math.pi / (2.0 * self.length)
@@ -77,7 +78,7 @@ class Bar:
         self.state[4] = self.amplitude * beta * np.cos(s)
         self.state[8] = 1.0 / (1.0 + scene.time_step * self.state[4])
         self.middle = -free - self.length / 2.0
-        self.simulation = solid_simulation(scene, particles, self.state, **options)
+        self.simulation = solid_simulation(scene, particles, self.state, precision)
         self.objective = Objective.of(particles, (-1.0, 0.0))
         self.checkpointing = checkpointing or Checkpointing()
 

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cache
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,8 +22,8 @@ from mpmopt.errors import DesignError, SceneError, SimulationError
 from mpmopt.particles import mirror_images
 from mpmopt.problem import Problem, Variables
 from mpmopt.scene import Actuator, Grid, Mirror, Scene
+from mpmopt.simulate import Precision
 
-Precision = Literal["double", "single"]
 # The variables of one robot for whatever problem asks: a function of position, say.
 Design = Callable[[Problem], NDArray[np.float64]]
 
@@ -106,8 +106,7 @@ class Discretisation:
         checkpointing: Checkpointing | None = None,
     ) -> Problem:
         """The `Problem` of the scene in this discretisation."""
-        precision = {} if self.precision == "double" else {"precision": self.precision}
-        return Problem(self.scene(scene), beta, checkpointing, leave_out, **precision)
+        return Problem(self.scene(scene), beta, checkpointing, leave_out, precision=self.precision)
 
 
 @dataclass(frozen=True)
@@ -236,7 +235,7 @@ def measure(
             schedule = store.schedule
         _compile(discretisation.precision)
         (value, gradient), seconds = timed(lambda: problem.value_and_gradient(x), repeats)
-    except (SceneError, SimulationError, TypeError) as error:
+    except (SceneError, SimulationError) as error:
         return Measured(discretisation, failure=str(error))
     numbers = (schedule.segment + 1) * schedule.step_bytes
     stored = schedule.stored_bytes if schedule.in_memory else 0
