@@ -354,12 +354,12 @@ def cheapest(
 ) -> Cheapest:
     """The cheapest discretisation whose objective and gradient are within a tolerance.
 
-    The finest cells that are affordable, up to twice the scene's own along each axis at a Courant
-    number of 0.4, are the reference. The others are measured in order of their work, particles
-    times steps, until one is within the tolerance and its neighbour with the next finer cells is
-    too, so that no error that only happens to vanish is taken for accuracy. Single precision is
-    tried where double suffices; one half is simulated where scene and design are symmetric. The
-    filter keeps the scene's length.
+    The finest cells that are affordable, up to twice the scene's own along each axis, at the
+    largest Courant number up to 0.4 that does not fail, are the reference. The others are measured
+    in order of their work, particles times steps, until one is within the tolerance and its
+    neighbour with the next finer cells is too, so that no error that only happens to vanish is
+    taken for accuracy. Single precision is tried where double suffices; one half is simulated where
+    scene and design are symmetric. The filter keeps the scene's length.
 
     Parameters
     ----------
@@ -404,21 +404,29 @@ def cheapest(
             found[item] = measure(scene, item, design, beta, patch, leave_out=leave_out)
         return found[item]
 
-    own = result(Discretisation.of(scene, mirror=plane))
-    pace = own.seconds / _work(own.discretisation)
-    at_reference = scene.particles_per_cell, REFERENCE_COURANT
+    own = Discretisation.of(scene, mirror=plane)
+    in_order = sorted(grid.items(), key=lambda pair: _work(pair[1]))
+    tried = (result(item) for item in (own, *(item for _, item in in_order)))
+    first = next((measured for measured in tried if not measured.failure), None)
+    if first is None:
+        raise DesignError(f"cheapest: nothing could be simulated: {result(own).failure}")
+    pace = first.seconds / _work(first.discretisation)
     affordable = [
         key
         for key, item in grid.items()
-        if key[1:] == at_reference and not pace * _work(item) > seconds
+        if key[1] == scene.particles_per_cell
+        and key[2] <= REFERENCE_COURANT
+        and not pace * _work(item) > seconds
     ]
-    runs = [key for key in sorted(affordable, reverse=True)[:2] if not result(grid[key]).failure]
-    if not runs:
+    affordable.sort(key=lambda key: (key[0], key[2]), reverse=True)
+    at = next((key for key in affordable if not result(grid[key]).failure), None)
+    if at is None:
+        failures = {result(grid[key]).failure for key in affordable}
         raise DesignError(
-            f"cheapest: no reference within seconds = {seconds:g} could be simulated; the scene's "
-            f"own discretisation: {own.failure or f'{own.seconds:.3g} s'}; allow more seconds"
+            f"cheapest: no reference could be simulated within seconds = {seconds:g}: "
+            f"{'; '.join(failures) or 'allow more'}"
         )
-    reference = result(grid[runs[0]])
+    reference = result(grid[at])
     rows: dict[Discretisation, Evidence] = {}
 
     def within(item: Discretisation) -> bool:
@@ -432,18 +440,18 @@ def cheapest(
         return rows[item].within
 
     within(reference.discretisation)
-    within(own.discretisation)
-    if len(runs) > 1:
-        within(grid[runs[1]])
+    within(own)
+    below = [key for key in grid if key[0] < at[0] and key[1:] == at[1:]]
+    coarser = grid[max(below)] if below else None
+    if coarser is not None:
+        within(coarser)
     best = reference.discretisation
-    for key, item in sorted(grid.items(), key=lambda pair: _work(pair[1])):
+    for key, item in in_order:
         if _work(item) >= _work(best):
             break
-        if key[0] > runs[0][0]:
+        if key[0] > at[0]:
             continue
-        finer = [
-            other for other in grid if key[0] < other[0] <= runs[0][0] and other[1:] == key[1:]
-        ]
+        finer = [other for other in grid if key[0] < other[0] <= at[0] and other[1:] == key[1:]]
         if within(item) and (not finer or within(grid[min(finer)])):
             best = item
     single = replace(best, precision="single")
@@ -451,12 +459,11 @@ def cheapest(
         best = single
     if plane is not None and scene.mirror is None:
         within(replace(best, mirror=None))
-    coarser = rows[grid[runs[1]]] if len(runs) > 1 else None
     return Cheapest(
         best,
         reference,
-        coarser.objective_error if coarser else math.nan,
-        coarser.gradient_error if coarser else math.nan,
+        rows[coarser].objective_error if coarser else math.nan,
+        rows[coarser].gradient_error if coarser else math.nan,
         tuple(rows.values()),
     )
 

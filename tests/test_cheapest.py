@@ -90,6 +90,20 @@ def test_a_failure_is_evidence_not_an_end():
     assert np.isnan(measured.travel)
 
 
+def test_single_precision_loses_digits_but_few():
+    scene = small_scene()
+    here = Discretisation.of(scene)
+    double, single = (
+        measure(scene, replace(here, precision=precision), smooth, 2.0, 1 / 16)
+        for precision in ("double", "single")
+    )
+    travel, gradient, angle = single.errors(double)
+    assert 0.0 < travel <= 1e-4
+    assert 0.0 < gradient <= 1e-3
+    assert angle <= 0.1
+    assert single.megabytes == pytest.approx(double.megabytes / 2, rel=0.05)
+
+
 @pytest.mark.parametrize(("tolerance", "gradient_tolerance"), [(0.1, math.inf), (0.2, 0.5)])
 def test_evidence_adds_up(tolerance, gradient_tolerance):
     scene = small_scene()
