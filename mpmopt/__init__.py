@@ -1,18 +1,21 @@
 """Topology optimisation of soft bodies that move, with a differentiable material point method."""
 
 from importlib import import_module
-from types import ModuleType
+from typing import Any
 
 __version__ = "0.1.0"
 
 _MODULES = (
-    "actuation", "binary", "case", "checkpoints", "design", "errors", "mma", "mpm", "objective",
-    "optimize", "particles", "plot", "problem", "runfile", "scene", "simulate", "verify",
+    "actuation", "audit", "binary", "case", "checkpoints", "design", "discretisation", "errors",
+    "mma", "mpm", "objective", "optimize", "particles", "plot", "problem", "runfile", "scene",
+    "simulate", "verify",
 )  # fmt: skip
 
 
-def __getattr__(name: str) -> ModuleType:
+def __getattr__(name: str) -> Any:
     """Import a module when it is first used, so that ``import mpmopt`` costs nothing."""
+    if name == "cheapest":
+        return import_module("mpmopt.discretisation").cheapest
     if name in _MODULES:
         return import_module(f"mpmopt.{name}")
     raise AttributeError(f"module 'mpmopt' has no attribute {name!r}")

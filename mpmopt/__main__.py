@@ -75,6 +75,31 @@ def audit(path: Path) -> int:
     return 0
 
 
+def cheapest(path: Path, tolerance: float, gradient_tolerance: float | None, seconds: float) -> int:
+    """Print the cheapest discretisation that tells a run's best design as well as the finest."""
+    from mpmopt import discretisation, runfile
+
+    run = runfile.read(path)
+    problem = run.problem()
+    found = discretisation.cheapest(
+        problem.scene,
+        run.best,
+        tolerance,
+        beta=problem.chain.beta,
+        leave_out=problem.leave_out,
+        gradient_tolerance=gradient_tolerance,
+        seconds=seconds,
+        progress=lambda line: print(line, flush=True),
+    )
+    print(f"reference                {found.reference.discretisation}")
+    print(
+        f"its own uncertainty      travel {found.objective_uncertainty:.1%}, "
+        f"gradient {found.gradient_uncertainty:.1%}"
+    )
+    print(f"cheapest within {tolerance:<8.3g} {found.best}")
+    return 0
+
+
 def main(argv: list[str] | None = None) -> int:
     """Run a command; 0 if all is well, 1 if not, 2 if it was not understood."""
     parser = argparse.ArgumentParser(prog="python -m mpmopt", description=__doc__)
@@ -91,6 +116,24 @@ def main(argv: list[str] | None = None) -> int:
     command = commands.add_parser("audit", help="simulate a run's best design more finely")
     command.add_argument("path", type=Path, metavar="RUN.h5")
     command.set_defaults(do=lambda arguments: audit(arguments.path))
+    command = commands.add_parser(
+        "cheapest", help="find the cheapest discretisation that is accurate enough"
+    )
+    command.add_argument("path", type=Path, metavar="RUN.h5")
+    command.add_argument(
+        "--tol", type=float, default=0.05, help="relative tolerance of travel and gradient (0.05)"
+    )
+    command.add_argument(
+        "--gradient-tol", type=float, default=None, help="another one of the gradient; inf: any"
+    )
+    command.add_argument(
+        "--seconds", type=float, default=60.0, help="what the finest reference may take (60)"
+    )
+    command.set_defaults(
+        do=lambda arguments: cheapest(
+            arguments.path, arguments.tol, arguments.gradient_tol, arguments.seconds
+        )
+    )
     arguments = parser.parse_args(argv)
     try:
         return int(arguments.do(arguments))

@@ -4,29 +4,10 @@ import math
 
 import numpy as np
 import pytest
+from exact import at_rest, manufactured_error, solid_simulation
 
-from mpmopt import mpm
 from mpmopt.particles import Particles, lay_out
 from mpmopt.scene import Grid, Material, Scene, Solid, Wall
-from mpmopt.simulate import Simulation, world_of
-
-
-def solid_simulation(scene, particles=None, state=None):
-    particles = particles or lay_out(scene)
-    ones = np.ones(len(particles.position))
-    material = scene.material
-    signal = np.zeros((scene.steps, len(scene.actuators)))
-    return Simulation(
-        scene, particles, material.density * ones, material.lame_lambda * ones,
-        material.lame_mu * ones, signal, state,
-    )  # fmt: skip
-
-
-def at_rest(particles):
-    state = np.zeros((12, len(particles.position)))
-    state[0:2] = particles.position.T
-    state[[8, 11]] = 1.0
-    return state
 
 
 def energy(scene, m, V, state):
@@ -146,93 +127,6 @@ def test_a_sliding_block_loses_friction_times_the_normal_impulse(friction):
     normal_impulse = rise + m.sum() * g * scene.duration
     assert normal_impulse >= 0.8 * m.sum() * g * scene.duration
     assert lost == pytest.approx(friction * normal_impulse, rel=1e-10, abs=1e-14)
-
-
-def manufactured_error(n, amplitude, courant=0.2, per_cell=2):
-    """Greatest rms error over half a period, in amplitudes, of the manufactured solution.
-
-    u_i = A sin(pi X_i) sin(c pi t + phi_i) on the unit square between mirror walls, which fold what
-    particles put on the ghost nodes back to the inside.
-    """
-    E, nu = 1e4, 0.3
-    la, mu = E * nu / ((1 + nu) * (1 - 2 * nu)), E / (2 * (1 + nu))
-    c = math.sqrt(E)
-    phase = np.array([[0.0], [math.pi]])
-    dx = 1.0 / n
-    offset = 3 * dx  # room for the ghost nodes
-    material = Material(lame_lambda=la, lame_mu=mu)
-    steps = math.ceil(1.0 / c / (courant * dx / material.wave_speed))
-    dt = 1.0 / c / steps
-    scene = Scene(
-        Grid((n + 6, n + 6), dx), time_step=dt, steps=steps, material=material,
-        body=(Solid((offset, offset), (1 + offset, 1 + offset)),), particles_per_cell=per_cell,
-    )  # fmt: skip
-    particles = lay_out(scene)
-    simulation = solid_simulation(scene, particles)
-    body, world = simulation.body, world_of(scene)
-    X = particles.position.T - offset
-    sine, cosine = np.sin(np.pi * X), np.cos(np.pi * X)
-
-    def exact(t):
-        u = amplitude * sine * np.sin(c * np.pi * t + phase)
-        slope = amplitude * np.pi * cosine * np.sin(c * np.pi * t + phase)
-        return u, 1.0 + slope
-
-    def force(t):
-        u, F = exact(t)
-        J = F[0] * F[1]
-        return np.pi**2 * u * (mu - c**2 - (la * (np.log(J) - 1.0) - mu) / F**2)
-
-    old = at_rest(particles)
-    rate = c * np.pi * np.cos(phase)
-    old[2:4] = amplitude * sine * rate
-    old[4], old[7] = amplitude * np.pi * cosine * rate
-    old[8], old[11] = 1.0 / (1.0 + dt * old[4]), 1.0 / (1.0 + dt * old[7])
-    shape, groups, side = old.shape, len(body.mass), n + 7
-    every, window = (0, groups), (0, 0, side, side)
-    old = mpm.grouped(old)
-    new = old.copy()
-    nodes, velocity = np.zeros((1, side * side, mpm.NODE_SIZE)), np.zeros((1, 2 * side * side))
-    cells, velocity_cells = np.zeros((9 * side * side, 4)), np.zeros(18 * side * side)
-    tile, grid = mpm.make_tile(groups, old), nodes[0]
-    log_J = np.zeros((groups, 4))
-    worst = 0.0
-    for step in range(steps):
-        push = dt * force(step * dt)
-        old[2::12] += mpm.grouped(push[:1])
-        old[3::12] += mpm.grouped(push[1:])
-        mpm.deform(old, new, world, log_J, *every)
-        mpm.locate(old, world, window, tile, *every)
-        mpm.stress(old, new, log_J, body, world, np.zeros(0), tile, *every)
-        cells[:] = 0.0
-        mpm.p2g(old, body, tile, cells, *every)
-        mpm.taylor_adjoint(cells, window, grid)
-        mirror(grid.reshape(side, side, 4), 0, n)
-        mirror(grid.reshape(side, side, 4).transpose(1, 0, 2), 1, n)
-        for column in range(side):
-            mpm.grid_update(nodes, window, world, velocity, column)
-        mpm.taylor(velocity[0], window, window, velocity_cells)
-        mpm.g2p(old, new, world, tile, velocity_cells, *every)
-        old, new = new, old
-        u, _ = exact((step + 1) * dt)
-        error = mpm.ungrouped(old, *shape)[0:2] - offset - X - u
-        worst = max(worst, math.sqrt((error**2).sum(axis=0).mean()) / amplitude)
-    return worst
-
-
-def mirror(nodes, normal, n):
-    """Make momentum and mass symmetric about node rows 3 and 3 + n of the first axis."""
-    for row, inward in ((3, 1), (3 + n, -1)):
-        for k in (1, 2):
-            inside, ghost = nodes[row + k * inward], nodes[row - k * inward]
-            reflected = ghost.copy()
-            reflected[:, normal] *= -1.0
-            inside += reflected
-            ghost[:] = inside
-            ghost[:, normal] *= -1.0
-        nodes[row, :, normal] = 0.0
-        nodes[row, :, 1 - normal] *= 2.0
-        nodes[row, :, 2] *= 2.0
 
 
 def test_manufactured_solution_converges_with_order_two():

@@ -1,0 +1,611 @@
+"""Time against error: which discretisation a bar, a walker and a crawler need.
+
+    python cases/speed_accuracy.py --out DIR [--quick] [--peers]
+
+Sweeps cells, Courant number, particles per cell, precision, checkpoints and transfer. The bar has
+an exact answer; walker and crawler are designs given as functions of position, so that every
+resolution sees the same robot, and are compared with the finest that is affordable. Writes
+``speed_accuracy.csv``, ``.h5`` and ``.png``, and the tables of the documentation. `--peers` adds
+Taichi in both precisions and Warp at the paper's setting.
+"""
+
+import argparse
+import csv
+import datetime
+import importlib
+import importlib.metadata
+import json
+import math
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import crawler
+import h5py
+import numpy as np
+import walker
+from benchmark import processor
+from exact import Bar, manufactured_error
+
+from mpmopt.actuation import signal_adjoint
+from mpmopt.checkpoints import Checkpointing
+from mpmopt.discretisation import Discretisation, Measured, density, measure, timed
+from mpmopt.errors import MpmoptError
+from mpmopt.problem import Problem
+from mpmopt.scene import Scene
+
+BETA = 8.0
+PATCH = 1 / 32  # gradients are compared as sums over squares of this width
+# Heavier void than the cases have: where it is light, a few flung particles have a gradient that
+# grows without limit as cells shrink, and that would be all that the chart shows.
+FLOORS = {"mass_floor": 1e-1, "stiffness_floor": 1e-2}
+C = 1 / 64  # the unit of length of both robots
+
+
+def legs(distance: np.ndarray, width: float, height: float) -> np.ndarray:
+    """phi from the distance to a leg's middle line: a smooth ridge of a width, +-height."""
+    return height * (2.0 * np.exp(-math.log(2.0) * (2.0 * distance / width) ** 2) - 1.0)
+
+
+def walker_phi(position: np.ndarray) -> np.ndarray:
+    """Three legs that lean back, as in ``cases/walker.py``, with soft edges."""
+    x, y = position.T
+    foot = 2.5 * C * (11 * C - y) / (7 * C)
+    return legs(np.min([abs(x + foot - top * C) for top in (7, 13, 19)], axis=0), 2.6 * C, 0.3)
+
+
+def crawler_phi(position: np.ndarray) -> np.ndarray:
+    """A spine with three pairs of legs, as in ``cases/crawler.py``, with soft edges."""
+    x, y = position.T
+    height = abs(y - 32 * C)
+    foot = 4 * C * height / (6 * C)
+    lines = [*(abs(x + foot - top * C) for top in (15, 23, 31)), height]
+    return legs(np.min(lines, axis=0), 2 * C, 0.8)
+
+
+DURATION = 0.5  # two and a half strokes; gradients over longer times have no limit
+
+
+def lasting(scene: Scene, duration: float) -> Scene:
+    """The scene for another duration."""
+    return replace(scene, steps=round(duration / scene.time_step))
+
+
+# The paper's cells and step.
+ROBOTS: dict[str, tuple[Scene, Callable[[np.ndarray], np.ndarray]]] = {
+    "walker": (lasting(walker.walker(128, 2e-4).vary(**FLOORS), DURATION), walker_phi),
+    "crawler": (lasting(crawler.crawler(128, 2e-4).vary(**FLOORS), DURATION), crawler_phi),
+}
+
+
+def design(phi: Callable[[np.ndarray], np.ndarray]) -> Callable[[Problem], np.ndarray]:
+    """A robot's variables in any problem, driven as at the start of an optimisation."""
+
+    def variables(problem: Problem) -> np.ndarray:
+        position = problem.particles.position[problem.particles.designed]
+        return problem.join(phi(position), a=1.0, theta=-0.3, b=-0.5)
+
+    return variables
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What is chosen besides cells and step: one marker of the figure."""
+
+    name: str
+    marker: str
+    per_cell: int = 2
+    precision: str = "double"
+    memory: int = 256_000_000
+    blend_time: float = 0.0
+
+
+PLAIN = Choice("2 x 2 a cell, double", "o")
+MORE_PARTICLES = Choice("3 x 3 a cell", "s", per_cell=3)
+SINGLE = Choice("single precision", "^", precision="single")
+LITTLE_MEMORY = Choice("64 MB of states", "v", memory=64_000_000)
+ALL_KEPT = Choice("all states kept", "P", memory=2**33)
+BLENDS = tuple(
+    Choice(f"blend time {1e3 * tau:g} ms", marker, blend_time=tau)
+    for tau, marker in ((2e-3, "D"), (1e-2, "X"))
+)
+PEERS = {
+    "Taichi, double": ("taichi_mpm", "taichi", "*"),
+    "Taichi, single": ("taichi_mpm", "taichi", "h"),
+    "Warp, double": ("warp_mpm", "warp-lang", "p"),
+}
+
+
+@dataclass(frozen=True)
+class Point:
+    """One marker: a scene in one discretisation, and its errors.
+
+    Attributes
+    ----------
+    scene : str
+    n : int
+        Cells along the unit square, or along the bar.
+    steps : int
+    courant : float
+    choice : str
+    measured : Measured
+    travel_ratio : float
+        Distance over the reference's.
+    travel_error, gradient_error : float
+        Relative to the reference.
+    angle : float
+        Between the gradients, in degrees.
+    """
+
+    scene: str
+    n: int
+    steps: int
+    courant: float
+    choice: str
+    measured: Measured
+    travel_ratio: float = math.nan
+    travel_error: float = math.nan
+    gradient_error: float = math.nan
+    angle: float = math.nan
+
+    def against(self, reference: Measured) -> "Point":
+        """The same with its errors."""
+        travel, gradient, angle = self.measured.errors(reference)
+        return replace(
+            self,
+            travel_ratio=self.measured.travel / reference.travel,
+            travel_error=travel,
+            gradient_error=gradient,
+            angle=angle,
+        )
+
+    def row(self) -> dict[str, str]:
+        """One line of the CSV file."""
+        measured = self.measured
+        return {
+            "scene": self.scene, "choice": self.choice, "n": str(self.n),
+            "steps": str(self.steps), "Courant": f"{self.courant:.3g}",
+            "seconds": f"{measured.seconds:.3g}", "MB": f"{measured.megabytes:.3g}",
+            "travel": f"{measured.travel:.6g}", "travel error": f"{self.travel_error:.2e}",
+            "gradient norm": f"{np.linalg.norm(measured.gradient):.4g}",
+            "gradient error": f"{self.gradient_error:.2e}", "angle": f"{self.angle:.1f}",
+            "failure": measured.failure,
+        }  # fmt: skip
+
+
+def sweep(quick: bool) -> list[tuple[int, float, Choice]]:
+    """Cells, Courant number and choice of all points."""
+    smallest = {32: 0.1, 64: 0.1} if quick else {32: 0.05, 64: 0.05, 128: 0.05, 256: 0.2}
+    points = [
+        (n, courant, PLAIN)
+        for n, least in smallest.items()
+        for courant in COURANTS
+        if courant >= least
+    ]
+    others = (MORE_PARTICLES, SINGLE, LITTLE_MEMORY, ALL_KEPT)
+    points += [(n, 0.4, choice) for n in smallest if 32 < n < 256 for choice in others]
+    if not quick:
+        points += [PAPER, (256, 0.4, MORE_PARTICLES)]
+        points += [(n, 0.8, SINGLE) for n in (64, 128, 256)]
+    cells = (64,) if quick else (64, 128)
+    blends = [(n, courant) for n in cells for courant in (0.1, 0.2, 0.4, 0.8)]
+    return points + [(*where, blend) for where in blends for blend in BLENDS]
+
+
+COURANTS = (0.05, 0.1, 0.2, 0.4, 0.6, 0.8)
+PAPER = (128, ROBOTS["walker"][0].courant, PLAIN)
+RECOMMENDED = (128, 0.6, PLAIN)
+# The reference is at the Courant number of the recommended setting.
+REFERENCE, QUICK_REFERENCE = (384, 0.6, PLAIN), (128, 0.6, PLAIN)
+SHORT = 1.0  # seconds; what takes less is measured twice
+
+
+def measure_bar(n: int, courant: float, choice: Choice, repeats: int) -> Measured:
+    """The bar in one discretisation."""
+    bar = Bar(
+        n, courant, choice.per_cell, Checkpointing(memory=choice.memory), choice.blend_time,
+        choice.precision,
+    )  # fmt: skip
+    scene = bar.simulation.scene
+    here = replace(Discretisation.of(scene), precision=choice.precision)
+    try:
+        bar.value_and_gradient()  # kernels are compiled then
+        (travel, gradient), seconds = timed(bar.value_and_gradient, repeats)
+    except MpmoptError as error:
+        return Measured(here, failure=str(error))
+    return Measured(here, seconds, math.nan, travel, gradient)
+
+
+def measure_robot(name: str, n: int, courant: float, choice: Choice, repeats: int) -> Measured:
+    """A robot in one discretisation."""
+    scene, phi = ROBOTS[name]
+    scene = replace(scene, blend_time=choice.blend_time)
+    here = Discretisation.of(
+        scene, n / scene.grid.cells[0], courant,
+        particles_per_cell=choice.per_cell, precision=choice.precision,
+    )  # fmt: skip
+    return measure(
+        scene, here, design(phi), BETA, PATCH,
+        checkpointing=Checkpointing(memory=choice.memory), repeats=repeats,
+    )  # fmt: skip
+
+
+def run(points: Iterable[tuple[str, int, float, Choice]], rounds: int) -> list[Point]:
+    """Measure all points, in turns over the rounds; the fewest seconds count."""
+    points = list(points)
+    best: dict[tuple[str, int, float, Choice], Measured] = {}
+    for number in range(rounds):
+        for point in points:
+            earlier = best.get(point)
+            if earlier is not None and not earlier.seconds < SHORT:
+                continue
+            name, n, courant, choice = point
+            if name == "bar":
+                measured = measure_bar(n, courant, choice, 1)
+            else:
+                measured = measure_robot(name, n, courant, choice, 1)
+            if earlier is not None:
+                measured = replace(measured, seconds=min(measured.seconds, earlier.seconds))
+            best[point] = measured
+            if number == 0:
+                print(
+                    f"{name} n = {n}, Courant {courant:g}, {choice.name}: "
+                    + (measured.failure or f"{measured.seconds:.2f} s, {measured.travel:.5f}"),
+                    file=sys.stderr, flush=True,
+                )  # fmt: skip
+    return [
+        Point(name, n, best[key].discretisation.steps, courant, choice.name, best[key])
+        for key in points
+        for name, n, courant, choice in [key]
+    ]
+
+
+def front(points: Sequence[Point], error: str) -> list[Point]:
+    """The points that nothing is both faster and more accurate than, by seconds."""
+    best: list[Point] = []
+    usable = [p for p in points if math.isfinite(getattr(p, error)) and p.measured.seconds > 0.0]
+    for point in sorted(usable, key=lambda p: (p.measured.seconds, getattr(p, error))):
+        if not best or getattr(point, error) < getattr(best[-1], error):
+            best.append(point)
+    return best
+
+
+def peer_point(name: str, robot: str) -> Point:
+    """A peer at the paper's setting, in a process of its own."""
+    done = subprocess.run(
+        [sys.executable, __file__, "--out", ".", "--peer", name, "--robot", robot],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    if done.returncode:
+        raise SystemExit(f"{name} failed:\n{done.stderr[-2000:]}")
+    result = json.loads(done.stdout.splitlines()[-1])
+    scene = ROBOTS[robot][0]
+    measured = Measured(
+        Discretisation.of(scene), result["seconds"], result["megabytes"], result["travel"],
+        np.array(result["gradient"]),
+    )  # fmt: skip
+    print(f"{robot}, {name}: {measured.seconds:.2f} s", file=sys.stderr, flush=True)
+    return Point(robot, PAPER[0], scene.steps, scene.courant, name, measured)
+
+
+def print_peer(name: str, robot: str) -> None:
+    """In the process that `peer_point` starts; peers know no plane of symmetry."""
+    module, _, _ = PEERS[name]
+    peer = importlib.import_module(f"peers.{module}")
+    if "single" in name:
+        peer.real = peer.ti.f32
+    scene, phi = ROBOTS[robot]
+    plane, scene = scene.mirror, replace(scene, mirror=None)
+    problem = Problem(scene, BETA)
+    x = design(phi)(problem)
+    simulation = problem.simulation(x)
+    objective = problem.objective(simulation)
+    program = peer.prepare(simulation, objective)
+    program.value_and_gradient()
+    (value, bars), seconds = timed(program.value_and_gradient, 3)
+    variables = problem.split(x)
+    material = (np.asarray(bars[key], float) for key in ("density", "lame_lambda", "lame_mu"))
+    signal = signal_adjoint(scene, variables.a, variables.theta, np.asarray(bars["signal"], float))
+    gradient = np.concatenate([problem.chain.pullback(variables.phi, *material), *signal])
+    status = Path("/proc/self/status").read_text().splitlines()
+    print(
+        json.dumps(
+            {
+                "seconds": seconds,
+                "megabytes": next(int(s.split()[1]) for s in status if s.startswith("VmHWM"))
+                / 1024,
+                "travel": value - float(objective.value(simulation.initial)),
+                "gradient": density(problem, gradient, PATCH, plane).tolist(),
+            }
+        )
+    )
+
+
+def horizons() -> list[dict[str, str]]:
+    """How the gradient's error grows with the simulated time: n = 64 and 128 against 256."""
+    rows = []
+    for name, (scene, phi) in ROBOTS.items():
+        for duration in (0.25, 0.5, 1.0):
+            there = lasting(scene, duration)
+            coarse, middle, fine = (
+                measure(there, Discretisation.of(there, n / 128, 0.6), design(phi), BETA, PATCH)
+                for n in (64, 128, 256)
+            )
+            row = {"robot": name, "seconds simulated": f"{duration:g}"}
+            for n, measured in ((64, coarse), (128, middle)):
+                travel, gradient, angle = measured.errors(fine)
+                row[f"travel, n = {n}"] = f"{travel:.0%}"
+                row[f"gradient, n = {n}"] = f"{gradient:.0%}"
+                row[f"angle, n = {n}"] = f"{angle:.0f}"
+            rows.append(row)
+    return rows
+
+
+def manufactured() -> list[dict[str, str]]:
+    """The manufactured solution's error and its order."""
+    rows: list[dict[str, str]] = []
+    last = math.nan
+    for n in (8, 16, 32, 64):
+        error = manufactured_error(n, 1e-3)
+        order = "" if math.isnan(last) else f"{math.log2(last / error):.2f}"
+        rows.append({"n": str(n), "rms error / amplitude": f"{error:.2e}", "order": order})
+        last = error
+    return rows
+
+
+def travels(points: Sequence[Point]) -> list[dict[str, str]]:
+    """Distance by step, over the reference's: one line for each robot, n and transfer."""
+    rows = []
+    for name in ROBOTS:
+        for choice in (PLAIN, *BLENDS):
+            for n in sorted({p.n for p in points}):
+                line = {
+                    p.courant: p.travel_ratio
+                    for p in points
+                    if (p.scene, p.choice, p.n) == (name, choice.name, n)
+                }
+                if not line:
+                    continue
+                row = {"robot": name, "transfer": "APIC" if choice is PLAIN else choice.name}
+                row["n"] = str(n)
+                for courant in COURANTS:
+                    row[f"{courant:g}"] = f"{line[courant]:.3f}" if courant in line else ""
+                rows.append(row)
+    return rows
+
+
+def write_csv(path: Path, rows: Sequence[dict[str, str]]) -> None:
+    """A table with a header."""
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def machine() -> str:
+    """Where and when."""
+    versions = ", ".join(
+        f"{name} {importlib.metadata.version(name)}" for name in ("numba", "numpy")
+    )
+    return f"{datetime.date.today()}, one thread of {processor()}, {versions}"
+
+
+def write_h5(path: Path, points: Sequence[Point], references: dict[str, Measured]) -> None:
+    """All numbers, and the gradients as densities."""
+    with h5py.File(path, "w") as file:
+        file.attrs["machine"] = machine()
+        for name, reference in references.items():
+            mine = [p for p in points if p.scene == name]
+            group = file.create_group(name)
+            group.attrs["reference travel"] = reference.travel
+            group.create_dataset("reference gradient", data=reference.gradient)
+            columns = {
+                "n": [p.n for p in mine], "steps": [p.steps for p in mine],
+                "courant": [p.courant for p in mine],
+                "seconds": [p.measured.seconds for p in mine],
+                "megabytes": [p.measured.megabytes for p in mine],
+                "travel": [p.measured.travel for p in mine],
+                "travel_error": [p.travel_error for p in mine],
+                "gradient_error": [p.gradient_error for p in mine],
+                "angle": [p.angle for p in mine],
+            }  # fmt: skip
+            for key, values in columns.items():
+                group.create_dataset(key, data=np.array(values))
+            group.create_dataset("choice", data=[p.choice for p in mine], dtype=h5py.string_dtype())
+            empty = np.full_like(reference.gradient, np.nan)
+            gradients = [p.measured.gradient if p.measured.gradient.size else empty for p in mine]
+            group.create_dataset("gradient", data=np.array(gradients))
+
+
+COLOURS = {32: "#9e9e9e", 64: "#1f77b4", 128: "#e07b00", 256: "#2a9d3a"}
+TITLES = {
+    "bar": "(a) vibrating bar, against the exact answer",
+    "walker": "(b) walker",
+    "crawler": "(c) crawler",
+}
+
+
+def draw(path: Path, points: Sequence[Point], known: dict[str, tuple[float, float]]) -> None:
+    """The chart.
+
+    Parameters
+    ----------
+    path : Path
+    points : sequence of Point
+    known : mapping of str to (float, float)
+        By scene, how well its reference is known: travel and gradient.
+    """
+    import matplotlib
+
+    matplotlib.use("agg")
+    from matplotlib import pyplot as plt
+    from matplotlib.lines import Line2D
+
+    markers = {c.name: c.marker for c in (PLAIN, MORE_PARTICLES, SINGLE, LITTLE_MEMORY, ALL_KEPT)}
+    markers.update({blend.name: blend.marker for blend in BLENDS})
+    markers.update({name: marker for name, (_, _, marker) in PEERS.items()})
+    figure, axes = plt.subplots(3, 3, figsize=(16, 14.5))
+    for column, (name, title) in enumerate(TITLES.items()):
+        mine = [p for p in points if p.scene == name and not p.measured.failure]
+        for row, (error, what) in enumerate(
+            (("travel_error", "error of the distance"), ("gradient_error", "error of the gradient"))
+        ):
+            ax = axes[row, column]
+            _scatter(ax, mine, error, markers, known[name][row])
+            ax.set_title(title if row == 0 else "")
+            ax.set_xlabel("processor time of a value and gradient")
+            ax.set_ylabel(what)
+        _steps(axes[2, column], mine)
+    choices = [name for name in markers if any(p.choice == name for p in points)]
+    handles = [
+        Line2D([], [], marker="o", ls="", color=COLOURS[n], label=f"n = {n}")
+        for n in sorted({p.n for p in points})
+    ]
+    handles += [
+        Line2D([], [], marker=markers[name], ls="", mfc="none", mec="#333333", label=name)
+        for name in choices
+    ]
+    handles += [
+        Line2D([], [], color="black", lw=1.2, drawstyle="steps-post", label="Pareto front"),
+        plt.Rectangle((0, 0), 1, 1, color="#e8e8e8", label="less than the reference knows"),
+    ]
+    figure.legend(handles=handles, loc="lower center", ncols=6, frameon=False)
+    figure.subplots_adjust(0.06, 0.1, 0.985, 0.97, wspace=0.24, hspace=0.22)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def _scatter(
+    ax, points: Sequence[Point], error: str, markers: dict[str, str], known: float
+) -> None:
+    """Time against one error, with the Pareto front and the named settings."""
+    from matplotlib.ticker import LogLocator, NullFormatter
+
+    ax.loglog()
+    for n, colour in COLOURS.items():
+        line = sorted(
+            (p for p in points if p.n == n and p.choice == PLAIN.name), key=lambda p: p.courant
+        )
+        where = [(p.measured.seconds, getattr(p, error)) for p in line]
+        ax.plot(*zip(*where) if where else ([], []), color=colour, lw=0.8, alpha=0.6, zorder=1)
+    for p in points:
+        big = p.choice in PEERS
+        ax.plot(
+            p.measured.seconds, getattr(p, error), markers[p.choice], ms=11 if big else 7,
+            mfc=COLOURS[p.n] if p.choice == PLAIN.name or big else "white", mec=COLOURS[p.n],
+            mew=1.3, zorder=4 if big else 3,
+        )  # fmt: skip
+    best = front(points, error)
+    ax.plot(
+        [p.measured.seconds for p in best], [getattr(p, error) for p in best],
+        color="black", lw=1.2, drawstyle="steps-post", zorder=2,
+    )  # fmt: skip
+    low, high = ax.get_ylim()
+    if known > low:
+        ax.axhspan(low, known, color="#e8e8e8", zorder=0)
+        ax.set_ylim(low, high)
+    for label, (n, courant, choice), place in (
+        ("paper's setting", PAPER, (0.62, 0.95)),
+        ("recommended", RECOMMENDED, (0.05, 0.06)),
+    ):
+        for p in points:
+            if (p.n, p.courant, p.choice) == (n, courant, choice.name):
+                at = p.measured.seconds, getattr(p, error)
+                ax.plot(*at, "o", ms=15, mfc="none", mec="crimson", mew=1.6, zorder=5)
+                ax.annotate(
+                    f"{label}:\nn = {n}, Courant {courant:.2g}", at, xycoords="data",
+                    xytext=place, textcoords="axes fraction", color="crimson", fontsize=9,
+                    va="top" if place[1] > 0.5 else "bottom",
+                    arrowprops={"arrowstyle": "-", "color": "crimson", "lw": 0.8, "shrinkB": 7},
+                    bbox={"fc": "white", "ec": "none", "alpha": 0.8, "pad": 1}, zorder=6,
+                )  # fmt: skip
+    low, high = ax.get_ylim()
+    subs = (1.0, 2.0, 5.0) if high > 10.0 * low else (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0)
+    ax.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0), numticks=20))
+    ax.yaxis.set_major_locator(LogLocator(subs=subs, numticks=20))
+    ax.xaxis.set_major_formatter(lambda seconds, _: f"{seconds:g} s")
+    ax.yaxis.set_major_formatter(lambda share, _: f"{100.0 * share:.3g} %")
+    for axis in (ax.xaxis, ax.yaxis):
+        axis.set_minor_formatter(NullFormatter())
+    ax.grid(True, which="major", alpha=0.3)
+
+
+def _steps(ax, points: Sequence[Point]) -> None:
+    """Distance by Courant number, the reference's being one."""
+    for n, colour in COLOURS.items():
+        for choice, style in zip((PLAIN, *BLENDS[:1]), ("-o", "--D")):
+            line = sorted(
+                (p.courant, p.travel_ratio) for p in points if p.n == n and p.choice == choice.name
+            )
+            if line:
+                ax.plot(
+                    *zip(*line), style, color=colour, ms=5, lw=1.2,
+                    mfc=colour if choice is PLAIN else "white",
+                )  # fmt: skip
+    ax.axhline(1.0, color="black", lw=0.8)
+    ax.set_xscale("log")
+    ax.set_xticks(COURANTS, [f"{c:g}" for c in COURANTS])
+    ax.minorticks_off()
+    ax.set_xlabel("Courant number (solid: APIC; dashed: blended)")
+    ax.set_ylabel("distance, relative to the reference")
+    ax.grid(True, alpha=0.3)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Measure, and write tables and figure."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of results")
+    parser.add_argument("--quick", action="store_true", help="fewer cells and steps, one round")
+    parser.add_argument("--peers", action="store_true", help="Taichi and Warp too")
+    parser.add_argument("--peer", choices=list(PEERS), help=argparse.SUPPRESS)
+    parser.add_argument("--robot", choices=list(ROBOTS), help=argparse.SUPPRESS)
+    arguments = parser.parse_args(argv)
+    if arguments.peer:
+        print_peer(arguments.peer, arguments.robot)
+        return 0
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    path = arguments.out / "speed_accuracy"
+    os.environ.setdefault("MPMOPT_THREADS", "1")
+    wanted = sweep(arguments.quick)
+    reference = QUICK_REFERENCE if arguments.quick else REFERENCE
+    rounds = 1 if arguments.quick else 2
+    points = run([(name, *point) for name in TITLES for point in wanted], rounds)
+    references, known = {"bar": exact_bar()}, {"bar": (0.0, 0.0)}
+    for name in ROBOTS:
+        references[name] = run([(name, *reference)], 1)[0].measured
+        same = (
+            p for p in points if (p.scene, p.courant, p.choice) == (name, reference[1], PLAIN.name)
+        )
+        travel, gradient, _ = max(same, key=lambda p: p.n).measured.errors(references[name])
+        known[name] = travel, gradient
+    if arguments.peers:
+        points += [peer_point(name, robot) for robot in ROBOTS for name in PEERS]
+    points = [p.against(references[p.scene]) for p in points]
+    write_csv(Path(f"{path}.csv"), [p.row() for p in points])
+    write_csv(Path(f"{path}_travel.csv"), travels(points))
+    best = [
+        p for name in TITLES for p in front([q for q in points if q.scene == name], "travel_error")
+    ]
+    write_csv(Path(f"{path}_front.csv"), [p.row() for p in best])
+    if not arguments.quick:
+        write_csv(Path(f"{path}_horizon.csv"), horizons())
+        write_csv(Path(f"{path}_manufactured.csv"), manufactured())
+    write_h5(Path(f"{path}.h5"), points, references)
+    draw(Path(f"{path}.png"), points, known)
+    print(machine())
+    for name, (travel, gradient) in known.items():
+        print(f"{name}: reference known to {travel:.1%} of travel, {gradient:.0%} of the gradient")
+    return 0
+
+
+def exact_bar() -> Measured:
+    """The bar's exact answer."""
+    bar = Bar(32, 0.4)
+    return Measured(Discretisation.of(bar.simulation.scene), 0.0, 0.0, *bar.exact())
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,124 @@
+"""The chart of speed against accuracy, at tiny sizes."""
+
+import csv
+from dataclasses import replace
+
+import h5py
+import numpy as np
+import pytest
+import speed_accuracy
+from exact import Bar
+from speed_accuracy import BETA, PLAIN, ROBOTS, Point, design, front, sweep
+
+from mpmopt.discretisation import Discretisation, Measured
+from mpmopt.problem import Problem
+
+
+def bar_errors(n, courant, **options):
+    bar = Bar(n, courant, **options)
+    (travel, gradient), (exact, exact_gradient) = bar.value_and_gradient(), bar.exact()
+    error = np.linalg.norm(gradient - exact_gradient) / np.linalg.norm(exact_gradient)
+    return abs(travel / exact - 1.0), error
+
+
+def test_the_bar_is_off_by_the_volumes_of_the_step_before():
+    # Weighed by volumes one step old, the middle is dt (2 / pi - 1 / 2) v0 cos(w t) farther: in
+    # units of v0 / (2 w) sin(w t), and with w t = 2 pi + pi / 4, that is (4 / pi - 1) w dt.
+    bar = Bar(64, 0.8)
+    step = bar.simulation.scene.time_step
+    travel, gradient = bar_errors(64, 0.8)
+    assert travel == pytest.approx((4.0 / np.pi - 1.0) * bar.omega * step, rel=0.05)
+    assert gradient <= 1.2 * travel
+
+
+def test_the_bar_and_its_gradient_converge_with_cells_and_step_together():
+    errors = np.array([bar_errors(n, 0.8) for n in (16, 32, 64)])
+    order = np.log2(errors[:-1] / errors[1:])
+    assert np.all(order[0] >= 0.55)
+    assert np.all(order[1] >= 0.8)
+
+
+def test_at_small_steps_the_bar_is_right_to_the_order_of_the_cells():
+    coarse, fine = np.array([bar_errors(n, 0.1) for n in (16, 32)])
+    assert np.all(coarse <= 6e-3)
+    assert np.all(fine <= 1e-3)
+
+
+@pytest.mark.parametrize("name", list(ROBOTS))
+def test_every_resolution_sees_the_same_robot(name):
+    scene, phi = ROBOTS[name]
+    mass = []
+    for n in (64, 128, 256):
+        problem = Problem(Discretisation.of(scene, n / 128, 0.4).scene(scene), BETA)
+        gamma = problem.gamma(design(phi)(problem))
+        volume = problem.particles.volume[problem.particles.designed]
+        mass.append(gamma @ volume / volume.sum())
+    assert 0.2 < mass[-1] < 0.8
+    # The filter is as wide as the cells are, so it blurs less on finer grids.
+    assert max(mass) / min(mass) <= 1.03
+
+
+def test_the_front_is_a_front():
+    rng = np.random.default_rng(5)
+    here = Discretisation((4, 4), 1)
+    points = [
+        Point("bar", 32, 1, 0.4, PLAIN.name, Measured(here, seconds), travel_error=error)
+        for seconds, error in rng.uniform(0.1, 1.0, (50, 2))
+    ]
+    points.append(replace(points[0], travel_error=np.nan))
+    best = front(points, "travel_error")
+    assert 2 <= len(best) < 50
+
+    def beats(one, other):
+        return (
+            one.measured.seconds <= other.measured.seconds
+            and one.travel_error <= other.travel_error
+            and one is not other
+        )
+
+    for point in points[:-1]:
+        assert any(one is point or beats(one, point) for one in best)
+        assert (point in best) == (not any(beats(other, point) for other in points))
+
+
+@pytest.mark.parametrize("quick", [True, False])
+def test_all_points_can_be_laid_out_and_are_measured_once(quick):
+    points = sweep(quick)
+    assert len(set(points)) == len(points)
+    for name, (scene, _) in ROBOTS.items():
+        for n, courant, choice in points:
+            here = Discretisation.of(
+                scene, n / 128, courant, particles_per_cell=choice.per_cell
+            ).scene(scene)
+            assert here.courant <= courant * (1.0 + 1e-9), name
+    if not quick:
+        assert speed_accuracy.PAPER in points
+        assert speed_accuracy.RECOMMENDED in points
+
+
+@pytest.mark.parametrize("drawn", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_a_chart_is_left_with_its_tables(tmp_path, monkeypatch, drawn):
+    if not drawn:
+        monkeypatch.setattr(speed_accuracy, "draw", lambda path, points, known: path.touch())
+    for name, (scene, phi) in ROBOTS.items():
+        monkeypatch.setitem(ROBOTS, name, (speed_accuracy.lasting(scene, 0.02), phi))
+    monkeypatch.setattr(Bar, "duration", 1.0)
+    points = [(32, 0.4, PLAIN), (32, 0.8, PLAIN), (64, 0.8, PLAIN)]
+    monkeypatch.setattr(speed_accuracy, "sweep", lambda quick: points)
+    monkeypatch.setattr(speed_accuracy, "QUICK_REFERENCE", (96, 0.8, PLAIN))
+    assert speed_accuracy.main(["--quick", "--out", str(tmp_path)]) == 0
+    assert ((tmp_path / "speed_accuracy.png").stat().st_size > 10_000) == drawn
+    with (tmp_path / "speed_accuracy.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["scene"], row["n"]) for row in rows] == [
+        (name, n) for name in ("bar", "walker", "crawler") for n in ("32", "32", "64")
+    ]
+    assert not any(row["failure"] for row in rows)
+    with h5py.File(tmp_path / "speed_accuracy.h5") as file:
+        for name in ROBOTS:
+            group = file[name]
+            travel = group["travel"][:] / group.attrs["reference travel"]
+            assert np.abs(travel - 1.0) == pytest.approx(group["travel_error"][:])
+            apart = np.linalg.norm(group["gradient"][:] - group["reference gradient"][:], axis=1)
+            norm = np.linalg.norm(group["reference gradient"][:])
+            assert apart / norm == pytest.approx(group["gradient_error"][:])
