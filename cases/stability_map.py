@@ -26,6 +26,7 @@ from stability import (
     figure,
     gradients,
     optimiser,
+    safe,
     time_step,
     weak,
 )
@@ -33,7 +34,7 @@ from stability.common import Found
 
 from mpmopt.runfile import replace_file
 
-MODULES = (time_step, weak, actuation, deformation, contact, gradients, optimiser)
+MODULES = (time_step, weak, actuation, deformation, contact, safe, gradients, optimiser)
 
 
 def as_csv(rows: Sequence[dict[str, Any]]) -> str:

@@ -17,12 +17,12 @@ from mpmopt.particles import lay_out
 from mpmopt.problem import Variables
 from mpmopt.scene import Actuator, Grid, Material, Scene
 from stability.common import Found, Line, at_rest, largest, solid, stretch
+from stability.safe import STRENGTH
 from stability.weak import courant_scene
 
 KICK = 1e-6  # velocity of a perturbation, in wave speeds
 STRENGTHS = (0.1, 0.2, 0.4, 0.6, 0.8, 0.9, 0.95, 0.99)
 COURANTS = (0.14, 0.25, 0.35, 0.5, 0.6, 0.7, 0.8)
-SAFE_STRENGTH = 0.6
 
 
 def equilibrium_stretch(strength: float) -> float:
@@ -137,14 +137,14 @@ def measure(quick: bool) -> Found:
         )
 
     pushing = [r for r in walkers if r["bias"] < 0.0]
-    safe = [r for r in pushing if r["strength"] <= SAFE_STRENGTH]
-    rest = [r for r in pushing if r["strength"] > SAFE_STRENGTH]
+    safe = [r for r in pushing if r["strength"] <= STRENGTH]
+    rest = [r for r in pushing if r["strength"] > STRENGTH]
     failed = sum(bool(r["error"]) for r in rest)
     walking = Line(
         "Strong actuation: a walker below that limit",
         f"stretch at rest {equilibrium_stretch(0.5):.2f} at mu / 2, "
         f"{equilibrium_stretch(1.0):.2f} at mu",
-        f"up to {SAFE_STRENGTH} mu distances at Courant {COURANTS[0]:g} to {COURANTS[-1]:g} lie "
+        f"up to {STRENGTH} mu distances at Courant {COURANTS[0]:g} to {COURANTS[-1]:g} lie "
         f"within {spread(safe):.3f} (stretch up to {max(r['stretch'] for r in safe):.1f}), above "
         f"within {spread(rest):.3f} (stretch up to {np.nanmax([r['stretch'] for r in rest]):.1f})",
         f"{failed} of {len(rest)} strong runs end in a SimulationError; **the others run, and "

@@ -316,7 +316,7 @@ def measure(quick: bool) -> Found:
         )
     )
     flights = found.tables["leaving"] = []
-    for speed in (0.1, 0.37, 1.0):
+    for speed in (0.11, 0.37, 1.01):
         noticed, expected, text = thrown(speed)
         flights.append({"speed": speed, "step": noticed, "expected": expected, "failure": text})
     found.lines.append(

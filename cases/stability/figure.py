@@ -12,8 +12,9 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from stability.time_step import RESONANCES
-from stability.weak import HEAVY, SAFE_COURANT
+from stability.safe import STRENGTH
+from stability.time_step import RESONANCES, SAFE_COURANT, SAFE_TURN
+from stability.weak import HEAVY, SAFE_STIFFNESS
 
 Rows = list[dict[str, Any]]
 Tables = Mapping[str, Rows]
@@ -68,8 +69,8 @@ def motion(axes: Axes, tables: Tables) -> None:
         note(axes, 3.1, height + 0.01, name, ha="right")
     axes.set_ylim(0.0, 1.0)
     rate = np.geomspace(0.03, 3.0, 50)
-    axes.fill_between(rate, np.minimum(0.5, 0.45 / rate), **SAFE)
-    note(axes, 0.035, 0.05, "safe: Courant <= 0.5, dt |C| <= 0.45")
+    axes.fill_between(rate, np.minimum(SAFE_COURANT, SAFE_TURN / rate), **SAFE)
+    note(axes, 0.035, 0.05, f"safe: Courant <= {SAFE_COURANT:g}, dt |C| <= {SAFE_TURN:g}")
     axes.set_xlabel("|C| in $c_p$ / dx")
     axes.set_ylabel("Courant number")
     axes.set_title("Time step: one particle in motion")
@@ -101,11 +102,11 @@ def weak(heavy: bool) -> Callable[[Axes, Tables], None]:
                 axes.text(j, i, f"{failed}/{runs}", color="w", ha="center", va="center", fontsize=7)
             colour[i, j] = max(np.nanmax([row["largest_deviation"] for row in both] + [1e-6]), 1e-6)
         image = axes.imshow(colour, cmap="YlOrBr", norm=LogNorm(1e-5, 1e-1), aspect="auto")
-        axes.axvline(
-            np.interp(SAFE_COURANT, courants, np.arange(len(courants))) + 0.5,
-            color="tab:green",
-            lw=2,
-        )
+        if heavy:
+            wide = sum(courant <= SAFE_COURANT for courant in courants)
+            top = sum(epsilon > SAFE_STIFFNESS for epsilon in epsilons)
+            corner, size = (-0.5, top - 0.5), (wide, len(epsilons) - top)
+            axes.add_patch(Rectangle(corner, *size, fill=False, ec="tab:green", lw=3, zorder=3))
         axes.set_xticks(range(len(courants)), [f"{c:g}" for c in courants], fontsize=7)
         axes.set_yticks(range(len(epsilons)), [f"{e:.0e}" for e in epsilons], fontsize=7)
         axes.set_xlabel("Courant number")
@@ -131,7 +132,7 @@ def ellipticity(axes: Axes, tables: Tables) -> None:
         lost = [row["strength"] for row in some if row["error"]]
         axes.plot(lost, np.full(len(lost), 0.27), "x", color=FAILED)
     axes.axvline(1.0, **LIMIT)
-    axes.axvspan(0.0, 0.6, **SAFE)
+    axes.axvspan(0.0, STRENGTH, **SAFE)
     axes.axvspan(1.0, 1.1, color=FAILED, alpha=0.08, lw=0)
     note(axes, 1.01, 0.5, "refused:\nellipticity\nlost")
     axes.set_xlim(0.0, 1.12)
@@ -153,13 +154,12 @@ def fracture(axes: Axes, tables: Tables) -> None:
         )
         axes.axvline(2 * n, color=f"C{n}", ls="--", lw=1)
         axes.axvline(n, color=f"C{n}", ls=":", lw=1)
-    note(axes, 2.05, 0.02, "1 per\ncell", va="bottom")
-    note(axes, 4.05, 0.55, "no node\nshared")
+    note(axes, 4.1, 0.92, "dotted: 1 particle a cell\ndashed: no node shared", va="top")
     axes.axvspan(1.0, 2.0, **SAFE)
     axes.set_xlabel("stretch")
     axes.set_ylabel("force across the weakest cut")
     axes.set_title("Numerical fracture")
-    axes.legend(fontsize=7, loc="upper right")
+    axes.legend(fontsize=7, loc="center right")
 
 
 def vortex(axes: Axes, tables: Tables) -> None:
@@ -282,7 +282,7 @@ def plot(path: Path, tables: Tables) -> None:
         axes.yaxis.label.set_fontsize(8)
         axes.tick_params(labelsize=7)
     figure.suptitle(
-        "Where the method fails. Dashed: theory. Green: the region that docs/failure.rst calls safe.",
+        "Where the method fails. Dashed: theory. Green: what docs/failure.rst calls safe.",
         fontsize=12,
     )
     figure.savefig(path, dpi=110)

@@ -13,6 +13,8 @@ from mpmopt.scene import Grid, Scene, Solid
 from stability.common import Array, Found, Line, at_rest, energy, failure, largest, solid
 
 CELLS = 24
+# What the documentation calls safe: Courant number, and dt |C|.
+SAFE_COURANT, SAFE_TURN = 0.5, 0.35
 KICK = 1e-6  # velocity of a perturbation, in wave speeds
 
 
