@@ -22,9 +22,10 @@ from benchmark import processor, table
 from stability import (
     actuation,
     contact,
-    deformation,
     figure,
+    fracture,
     gradients,
+    inversion,
     optimiser,
     safe,
     time_step,
@@ -34,7 +35,9 @@ from stability.common import Found
 
 from mpmopt.runfile import replace_file
 
-MODULES = (time_step, weak, actuation, deformation, contact, safe, gradients, optimiser)
+MODULES = (
+    time_step, weak, actuation, inversion, fracture, contact, safe, gradients, optimiser,
+)  # fmt: skip
 
 
 def as_csv(rows: Sequence[dict[str, Any]]) -> str:

@@ -9,15 +9,16 @@ import stability_map
 from stability import (
     actuation,
     contact,
-    deformation,
+    fracture,
     gradients,
+    inversion,
     optimiser,
     safe,
     time_step,
     weak,
 )
 
-from mpmopt.errors import SceneError
+from mpmopt.errors import SceneError, SimulationError
 from mpmopt.particles import lay_out
 from mpmopt.scene import Material
 
@@ -141,36 +142,36 @@ def test_distances_agree_between_steps_in_the_safe_region_only():
     assert max(row["stretch"] for row in strong) > 2.0
 
 
-# Large deformation.
+# Large fracture.
 
 
 def test_the_vortex_is_right_at_a_tenth_and_inverts_at_one():
-    assert deformation.vortex(0.1, 24) <= 0.132
-    assert deformation.vortex(0.1, 48) <= 0.05
+    assert inversion.vortex(0.1, 24) <= 0.132
+    assert inversion.vortex(0.1, 48) <= 0.05
     for cells in (24, 48):
-        with pytest.raises(deformation.SimulationError, match="inverted"):
-            deformation.vortex(1.0, cells)
+        with pytest.raises(SimulationError, match="inverted"):
+            inversion.vortex(1.0, cells)
 
 
 @pytest.mark.slow
 def test_the_vortex_converges_and_inverts_on_a_fine_grid():
-    coarse, fine = deformation.vortex(0.1, 48), deformation.vortex(0.1, 96)
+    coarse, fine = inversion.vortex(0.1, 48), inversion.vortex(0.1, 96)
     assert np.log2(coarse / fine) >= 1.9
-    with pytest.raises(deformation.SimulationError, match="inverted"):
-        deformation.vortex(1.0, 96)
+    with pytest.raises(SimulationError, match="inverted"):
+        inversion.vortex(1.0, 96)
 
 
 @pytest.mark.parametrize("per_cell", [2, 3])
 def test_a_cut_carries_all_up_to_one_particle_per_cell_and_nothing_at_half_of_one(per_cell):
-    assert deformation.weakest_cut(1.0 + 1e-6, per_cell) == pytest.approx(1.0, abs=1e-3)
-    assert deformation.weakest_cut(float(per_cell), per_cell) == pytest.approx(1.0, abs=1e-9)
-    assert deformation.weakest_cut(1.5 * per_cell, per_cell) == pytest.approx(0.54, abs=0.01)
-    assert deformation.weakest_cut(2.0 * per_cell, per_cell) == pytest.approx(0.0, abs=1e-9)
+    assert fracture.weakest_cut(1.0 + 1e-6, per_cell) == pytest.approx(1.0, abs=1e-3)
+    assert fracture.weakest_cut(float(per_cell), per_cell) == pytest.approx(1.0, abs=1e-9)
+    assert fracture.weakest_cut(1.5 * per_cell, per_cell) == pytest.approx(0.54, abs=0.01)
+    assert fracture.weakest_cut(2.0 * per_cell, per_cell) == pytest.approx(0.0, abs=1e-9)
 
 
 def test_a_pulled_bar_tears_with_two_particles_per_cell_and_comes_back_with_three():
-    torn, torn_stretch, _ = deformation.pulled_bar(1.5, 2)
-    whole, _, _ = deformation.pulled_bar(1.5, 3)
+    torn, torn_stretch, _ = fracture.pulled_bar(1.5, 2)
+    whole, _, _ = fracture.pulled_bar(1.5, 3)
     assert torn.min() > 0.0
     assert whole.min() < -0.9
     assert torn_stretch > 2.0
@@ -178,7 +179,7 @@ def test_a_pulled_bar_tears_with_two_particles_per_cell_and_comes_back_with_thre
 
 @pytest.mark.parametrize("speed", [0.37, 1.01])
 def test_leaving_the_grid_is_noticed_in_the_step_in_which_it_happens(speed):
-    noticed, expected, text = deformation.thrown(speed)
+    noticed, expected, text = fracture.thrown(speed)
     assert noticed == expected
     assert "left the grid" in text
     assert "larger grid" in text

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import scipy.linalg
@@ -105,10 +106,10 @@ def shifted(particles: Particles, by: float) -> Particles:
     )
 
 
-def resting_limits(quick: bool) -> list[dict[str, object]]:
+def resting_limits(quick: bool) -> list[dict[str, Any]]:
     """Limits of bodies at rest: linear theory beside what a small kick shows."""
     steps = 1000 if quick else 4000
-    rows: list[dict[str, object]] = []
+    rows: list[dict[str, Any]] = []
 
     def add(body: str, theory: float, holds: Callable[[float], bool]) -> None:
         measured = largest(holds, 0.3, 3.0, 0.005)
@@ -168,9 +169,9 @@ def survives(motion: Array, rate: float, courant: float, steps: int = 3000) -> b
     return not failure(run)
 
 
-def moving_limits(quick: bool) -> list[dict[str, object]]:
+def moving_limits(quick: bool) -> list[dict[str, Any]]:
     """Lowest Courant numbers at which an isolated particle in fast motion inverts."""
-    rows: list[dict[str, object]] = []
+    rows: list[dict[str, Any]] = []
     courants = np.arange(0.1, 0.9, 0.02 if quick else 0.01)
     for name, motion in MOTIONS.items():
         for rate in RATES[::3] if quick else RATES:
@@ -191,23 +192,21 @@ def measure(quick: bool) -> Found:
         replace(scene, time_step=1.001 * legal)
     except SceneError as error:
         said = type(error).__name__
-    by_body: dict[str, list[dict[str, object]]] = {}
+    by_body: dict[str, list[dict[str, Any]]] = {}
     for row in rest:
-        by_body.setdefault(str(row["body"]).split(",")[0], []).append(row)
+        by_body.setdefault(row["body"].split(",")[0], []).append(row)
     refused = f"Refused from Courant {legal * scene.material.wave_speed:.3f} on: {said}."
     lines = []
     for body, rows in by_body.items():
-        theory, measured = (
-            [float(str(row[key])) for row in rows] for key in ("theory", "measured")
-        )
+        theory, measured = ([row[key] for row in rows] for key in ("theory", "measured"))
         lines.append(
             Line(
                 f"Time step too long: {body}", f"{min(theory):.3f}", f"{min(measured):.3f}", refused
             )
         )
     worst = {
-        rate: min(float(str(r["measured"])) for r in motion if r["rate"] == rate)
-        for rate in dict.fromkeys(float(str(r["rate"])) for r in motion)
+        rate: min(r["measured"] for r in motion if r["rate"] == rate)
+        for rate in dict.fromkeys(r["rate"] for r in motion)
     }
     lines.append(
         Line(
