@@ -208,18 +208,25 @@ def incline(axes: Axes, tables: Tables) -> None:
     axes.legend(fontsize=6, loc="center right", bbox_to_anchor=(1.0, 0.38))
 
 
-def onset(axes: Axes, tables: Tables) -> None:
-    """A dropped block's lowest particles."""
-    rows = tables["contact_onset"]
-    axes.plot(column(rows, "step"), column(rows, "free_fall"), **LIMIT, label="free fall")
-    axes.plot(column(rows, "step"), column(rows, "height"), label="lowest particles")
-    axes.axhline(1.5, color="0.35", ls=":", lw=1)
-    note(axes, 5, 1.53, "felt from 1.5 cells on")
-    axes.set_ylim(0.6, 2.4)
-    axes.set_xlabel("step")
-    axes.set_ylabel("cells above the last clamped row")
-    axes.set_title("Contact: a dropped block")
-    axes.legend(fontsize=7)
+def adversary(axes: Axes, tables: Tables) -> None:
+    """Share of evaluations that fail while a walker or crawler is optimised."""
+    rows = tables["adversary"]
+    by_floors = groups(rows, "mass_floor", "stiffness_floor")
+    courants = sorted({row["courant"] for row in rows})
+    width = 0.8 / len(by_floors)
+    for number, ((mass, stiffness), some) in enumerate(by_floors.items()):
+        for (courant,), both in groups(some, "courant").items():
+            failed, all_of_them = (sum(r[key] for r in both) for key in ("failed", "evaluations"))
+            x = courants.index(courant) + (number - (len(by_floors) - 1) / 2) * width
+            label = f"mass {mass:g}, stiffness {stiffness:g}" if both[0] is some[0] else None
+            axes.bar(x, failed / all_of_them, 0.9 * width, color=f"C{number}", label=label)
+            note(axes, x, failed / all_of_them, f"{failed}/{all_of_them}", ha="center", va="bottom")
+    axes.set_xticks(range(len(courants)), [f"{courant:g}" for courant in courants])
+    axes.margins(y=0.2)
+    axes.set_xlabel("Courant number")
+    axes.set_ylabel("share of evaluations that fail")
+    axes.set_title("The optimiser as adversary, by floors")
+    axes.legend(fontsize=7, loc="upper left")
 
 
 def sizes(axes: Axes, tables: Tables) -> None:
@@ -266,7 +273,7 @@ def optimiser(axes: Axes, tables: Tables) -> None:
 
 
 PANELS = (
-    rest, motion, weak(False), weak(True), ellipticity, fracture, vortex, onset, incline, sizes,
+    rest, motion, weak(False), weak(True), ellipticity, fracture, vortex, adversary, incline, sizes,
     radii, optimiser,
 )  # fmt: skip
 
