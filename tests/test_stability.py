@@ -8,6 +8,7 @@ import pytest
 import stability_map
 from stability import (
     actuation,
+    adversary,
     contact,
     fracture,
     gradients,
@@ -111,6 +112,16 @@ def test_nothing_fails_at_the_corner_of_the_safe_region(case, beta):
     row = safe.at_random(case, beta, seed=1)
     assert row["error"] == ""
     assert abs(row["half_step"] - row["distance"]) <= 0.02
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", ["walker", "crawler"])
+def test_the_optimiser_finds_no_design_that_fails_in_the_safe_region(case):
+    row = adversary.climb(case, *adversary.FLOORS[0], time_step.SAFE_COURANT, most=12)
+    assert row["failed"] == 0
+    assert row["gain"] > 0.05
+    assert row["gain_half_step"] > 0.5 * row["gain"]
+    assert adversary.climb("walker", *adversary.FLOORS[2], 0.8, most=12)["failed"] > 0
 
 
 @pytest.mark.slow

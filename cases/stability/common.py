@@ -81,20 +81,6 @@ def solid(
     return simulation
 
 
-def energy(scene: Scene, particles: Particles, state: Array) -> float:
-    """Kinetic energy, with that of the affine velocity, and stored energy of a solid body."""
-    material, volume = scene.material, particles.volume
-    inertia = scene.grid.dx**2 / 4.0
-    speed = (state[2:4] ** 2).sum(axis=0) + inertia * (state[4:8] ** 2).sum(axis=0)
-    log_J = np.log(state[8] * state[11] - state[9] * state[10])
-    stored = (
-        material.lame_mu / 2.0 * ((state[8:12] ** 2).sum(axis=0) - 2.0)
-        - material.lame_mu * log_J
-        + material.lame_lambda / 2.0 * log_J**2
-    )
-    return float((volume * (material.density / 2.0 * speed + stored)).sum())
-
-
 def stretch(states: Array) -> float:
     """Greatest principal stretch of any particle in states (..., 12, N)."""
     F = np.moveaxis(states[..., 8:12, :], -2, -1)

@@ -111,8 +111,8 @@ def weak(heavy: bool) -> Callable[[Axes, Tables], None]:
         axes.set_yticks(range(len(epsilons)), [f"{e:.0e}" for e in epsilons], fontsize=7)
         axes.set_xlabel("Courant number")
         axes.set_ylabel("stiffness floor")
-        what = f"mass floor {HEAVY:g}" if heavy else "mass floor the same"
-        axes.set_title(f"Void beside solid: {what}")
+        what = f"mass floor {HEAVY:g}" if heavy else "same mass floor"
+        axes.set_title(f"Void beside solid, {what} (n/m failed)")
         bar = axes.figure.colorbar(image, ax=axes, pad=0.02)
         bar.set_label("void moves L by", fontsize=7)
         bar.ax.tick_params(labelsize=7)

@@ -23,6 +23,14 @@ def scene_of(steps: int, contact: bool) -> Scene:
     return scene if contact else contact_free(scene, steps)
 
 
+def plain(scene: Scene, **more: Any) -> Problem:
+    """A problem at beta = 4 that is evaluated in its own time step and in no other."""
+    try:
+        return Problem(scene, beta=4.0, redo=0, **more)
+    except TypeError:  # there is no step control
+        return Problem(scene, beta=4.0, **more)
+
+
 def design(problem: Problem) -> Array:
     """Slanted legs with grey edges, which walk and stay on the grid for four seconds."""
     positions = problem.particles.position[problem.particles.designed]
@@ -50,7 +58,7 @@ def radius(problem: Problem, x: Array, value: float, gradient: Array) -> float:
 def single_precision(scene: Scene, x: Array) -> tuple[float, Array] | None:
     """Value and gradient in single precision, if the program has it."""
     try:
-        return Problem(scene, beta=4.0, precision="single").value_and_gradient(x)
+        return plain(scene, precision="single").value_and_gradient(x)
     except TypeError:
         return None
 
@@ -58,7 +66,7 @@ def single_precision(scene: Scene, x: Array) -> tuple[float, Array] | None:
 def at_horizon(steps: int, contact: bool) -> dict[str, Any]:
     """One horizon: sizes, errors of single precision, and the radius."""
     scene = scene_of(steps, contact)
-    problem = Problem(scene, beta=4.0)
+    problem = plain(scene)
     x = design(problem)
     value, gradient = problem.value_and_gradient(x)
     row = {

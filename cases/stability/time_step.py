@@ -11,7 +11,7 @@ from mpmopt import mpm
 from mpmopt.errors import SceneError, SimulationError
 from mpmopt.particles import Particles, lay_out
 from mpmopt.scene import Grid, Scene, Solid
-from stability.common import Array, Found, Line, at_rest, energy, failure, largest, solid
+from stability.common import Array, Found, Line, at_rest, failure, largest, solid
 
 CELLS = 24
 # What the documentation calls safe: Courant number, and dt |C|.
@@ -84,12 +84,10 @@ def stays_small(scene: Scene, particles: Particles, mass: Array, courant: float)
     state = at_rest(particles)
     speed = scene.material.wave_speed
     state[2:8] = KICK * speed * rng.uniform(-1.0, 1.0, state[2:8].shape)
-    before = energy(scene, particles, state)
     dt = courant * scene.grid.dx / speed
     simulation = solid(scene, particles, state, share={"mass": mass}, time_step=dt)
     try:
-        # Relative to the solid's mass; a heavy rim changes both by the same factor.
-        return energy(scene, particles, simulation.run()) <= 10.0 * before
+        return bool(np.abs(simulation.run()[2:8]).max() <= 3.0 * np.abs(state[2:8]).max())
     except SimulationError:
         return False
 
