@@ -82,8 +82,8 @@ def measure(quick: bool) -> Found:
                 f"{floors[1]:g}",
                 "",
                 f"evaluations that fail, by Courant number: {share}; half the step keeps "
-                f"{np.nanmin(kept):.0%} to {np.nanmax(kept):.0%} of the gain; without void solid is "
-                f"stretched up to {np.nanmax([r['stretch_without_void'] for r in mine]):.1f}",
+                f"{np.nanmin(kept):.0%} to {np.nanmax(kept):.0%} of the gain; without void solid "
+                f"is stretched up to {np.nanmax([r['stretch_without_void'] for r in mine]):.1f}",
                 "SimulationError; the optimiser goes back with half the move limit.",
             )
         )
