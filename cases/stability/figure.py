@@ -210,7 +210,7 @@ def incline(axes: Axes, tables: Tables) -> None:
 
 def adversary(axes: Axes, tables: Tables) -> None:
     """Share of evaluations that fail while a walker or crawler is optimised."""
-    rows = tables["adversary"]
+    rows = [row for row in tables["adversary"] if row["redo"] == 0]
     by_floors = groups(rows, "mass_floor", "stiffness_floor")
     courants = sorted({row["courant"] for row in rows})
     width = 0.8 / len(by_floors)

@@ -8,6 +8,7 @@ from walker import slanted_legs, walker
 
 from mpmopt.problem import Problem
 from mpmopt.scene import Scene
+from mpmopt.simulate import Precision
 from mpmopt.verify import contact_free
 from stability.common import Array, Found, Line
 
@@ -23,12 +24,9 @@ def scene_of(steps: int, contact: bool) -> Scene:
     return scene if contact else contact_free(scene, steps)
 
 
-def plain(scene: Scene, **more: Any) -> Problem:
+def plain(scene: Scene, precision: Precision = "double") -> Problem:
     """A problem at beta = 4 that is evaluated in its own time step and in no other."""
-    try:
-        return Problem(scene, beta=4.0, redo=0, **more)
-    except TypeError:  # there is no step control
-        return Problem(scene, beta=4.0, **more)
+    return Problem(scene, beta=4.0, precision=precision, redo=0)
 
 
 def design(problem: Problem) -> Array:
