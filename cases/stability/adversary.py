@@ -47,8 +47,8 @@ def climb(
     row: dict[str, Any] = {
         "case": case, "mass_floor": mass, "stiffness_floor": stiffness, "courant": courant,
         "redo": redo, "evaluations": len(run.history), "failed": run.failed_evaluations,
-        "redone": run.redone_evaluations, "gain": best.objective - reference, "gain_half_step": np.nan,
-        "gain_without_void": np.nan, "stretch_without_void": np.nan,
+        "redone": run.redone_evaluations, "gain": best.objective - reference,
+        "gain_half_step": np.nan, "gain_without_void": np.nan, "stretch_without_void": np.nan,
     }  # fmt: skip
     half = Problem(problem.scene.vary(time_step=best.time_step / 2.0), BETAS[best.stage], redo=redo)
     with suppress(SimulationError):
