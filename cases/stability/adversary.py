@@ -1,0 +1,109 @@
+"""The optimiser as an adversary: it finds designs in which weak particles fail, or propel."""
+
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+
+from mpmopt.binary import THRESHOLD, distance, solid_body
+from mpmopt.errors import SimulationError
+from mpmopt.optimize import Settings, Stage, optimise
+from mpmopt.problem import Problem
+from mpmopt.scene import Material
+from stability.common import Found, Line, stretch
+from stability.weak import CASES, HEAVY, SAFE_STIFFNESS, courant_scene
+
+FLOORS = ((HEAVY, SAFE_STIFFNESS), (1e-3, 1e-3), (1e-5, 1e-5))  # of mass and stiffness
+COURANTS = (0.25, 0.5, 0.8)
+BETAS = (1, 4, 16)
+
+
+def climb(
+    case: str, mass: float, stiffness: float, courant: float, most: int, redo: int = 0
+) -> dict[str, Any]:
+    """A short optimisation with long moves: what fails, and what is left at half the step.
+
+    Parameters
+    ----------
+    case : str
+    mass, stiffness : float
+        Floors.
+    courant : float
+    most : int
+        Successful evaluations at each of three sharpnesses.
+    redo : int
+        How often the program may halve the step of an evaluation; 0 shows how many would fail.
+    """
+    scene = courant_scene(case, courant, 64, Material(mass_floor=mass, stiffness_floor=stiffness))
+    stages = tuple(
+        Stage(beta, mass, stiffness, scene.time_step, move_limit=0.1, redo=redo) for beta in BETAS
+    )
+    settings = Settings(stages, least_iterations=most, most_iterations=most)
+    run = optimise(scene, settings, Problem(scene).join(0.0, 1.0, -0.3, -0.5))
+    best, problem = run.result, run.problem()
+    x, variables = best.x, problem.split(best.x)
+    block = np.ones(variables.phi.size, dtype=bool)
+    reference = distance(problem.scene, block, variables)
+    row: dict[str, Any] = {
+        "case": case, "mass_floor": mass, "stiffness_floor": stiffness, "courant": courant,
+        "redo": redo, "evaluations": len(run.history), "failed": run.failed_evaluations,
+        "redone": run.redone_evaluations, "gain": best.objective - reference,
+        "gain_half_step": np.nan, "gain_without_void": np.nan, "stretch_without_void": np.nan,
+    }  # fmt: skip
+    half = Problem(problem.scene.vary(time_step=best.time_step / 2.0), BETAS[best.stage], redo=redo)
+    with suppress(SimulationError):
+        row["gain_half_step"] = float(half.value(x)) - reference
+    simulation, objective = solid_body(problem.scene, best.gamma >= THRESHOLD, variables)
+    with suppress(SimulationError):
+        states = simulation.run([*range(0, simulation.steps, 10), simulation.steps])
+        row["gain_without_void"] = float(objective.value(states[-1])) - reference
+        row["stretch_without_void"] = stretch(states)
+    return row
+
+
+def measure(quick: bool) -> Found:
+    """Both cases by floors and Courant numbers; in short, only the safe corner and a bad one."""
+    choices = [(FLOORS[0], 0.5), (FLOORS[2], 0.8)]
+    if not quick:
+        choices = [(floors, courant) for floors in FLOORS for courant in COURANTS]
+    rows = [
+        climb(case, *floors, courant, 6 if quick else 12, redo)
+        for redo in (0, 2)
+        for case in CASES
+        for floors, courant in choices
+        if redo == 0 or courant == COURANTS[-1]
+    ]
+    lines = []
+    for floors in FLOORS:
+        both = [row for row in rows if (row["mass_floor"], row["stiffness_floor"]) == floors]
+        mine = [row for row in both if row["redo"] == 0]
+        if not mine:
+            continue
+        failed, redone, of = (
+            sum(row[key] for row in both if row["redo"])
+            for key in ("failed", "redone", "evaluations")
+        )
+        program = "SimulationError; the optimiser goes back with half the move limit."
+        if of:
+            program = (
+                f"Redone with half the step: at Courant {COURANTS[-1]:g} {redone} of {of} are "
+                f"redone and {failed} fail (SimulationError)."
+            )
+        share = ", ".join(
+            f"{sum(r['failed'] for r in mine if r['courant'] == c)} of "
+            f"{sum(r['evaluations'] for r in mine if r['courant'] == c)} at {c:g}"
+            for c in dict.fromkeys(row["courant"] for row in mine)
+        )
+        kept = [row["gain_half_step"] / row["gain"] for row in mine if row["gain"] > 0.02]
+        lines.append(
+            Line(
+                f"The optimiser as adversary, floors of mass and stiffness {floors[0]:g}, "
+                f"{floors[1]:g}",
+                "",
+                f"without step control fail, by Courant number: {share}; half the step keeps "
+                f"{np.nanmin(kept):.0%} to {np.nanmax(kept):.0%} of the gain; without void solid "
+                f"is stretched up to {np.nanmax([r['stretch_without_void'] for r in mine]):.1f}",
+                program,
+            )
+        )
+    return Found({"adversary": rows}, lines)

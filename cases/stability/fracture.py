@@ -1,0 +1,176 @@
+"""Particles that lose each other, in a stretched body, or the grid."""
+
+import numpy as np
+
+from mpmopt.errors import SimulationError
+from mpmopt.particles import lay_out
+from mpmopt.scene import Grid, Material, Scene, Solid
+from stability.common import Array, Found, Line, at_rest, solid, stretch
+
+STRETCHES = (1.0 + 1e-6, 1.25, 1.5, 1.75, 2.0, 2.25, 2.5, 3.0, 3.5, 4.0, 5.0, 6.0, 7.0, 8.0)
+SPEEDS = (0.5, 0.75, 1.0, 1.25, 1.5, 2.0)
+
+
+def transmitted_force(factor: float, offset: float, per_cell: int = 2) -> float:
+    """Share of the traction that a cut through a uniformly stretched bar transmits.
+
+    Within one step, the right half of a bar gains momentum P h dt to the left.
+
+    Parameters
+    ----------
+    factor : float
+        Stretch along the bar; nothing across it.
+    offset : float
+        Place of the cut between two nodes, in cells.
+    per_cell : int
+        Particles per cell and direction, undeformed.
+    """
+    half = 8.0
+    cells = int(2 * half * factor) + 24
+    scene = Scene(
+        Grid((cells, 16), 1.0),
+        time_step=1e-3,
+        steps=1,
+        body=(Solid((2.0, 4.0), (2.0 + 2 * half, 12.0)),),
+        particles_per_cell=per_cell,
+    )
+    particles = lay_out(scene)
+    state = at_rest(particles)
+    middle = round(cells / 2) + offset
+    state[0] = middle + factor * (state[0] - 2.0 - half)
+    state[8] = factor
+    end = solid(scene, particles, state).run()
+    material = scene.material
+    right = state[0] > middle
+    gained = -material.density * (particles.volume * end[2])[right].sum()
+    nominal = material.lame_mu * (factor - 1.0 / factor) + (
+        material.lame_lambda * np.log(factor) / factor
+    )
+    return float(gained / (nominal * 8.0 * scene.time_step))
+
+
+def weakest_cut(factor: float, per_cell: int = 2) -> float:
+    """The least transmitted share over all places between two nodes."""
+    offsets = np.linspace(0.0, 1.0, 8, endpoint=False)
+    return min(transmitted_force(factor, float(offset), per_cell) for offset in offsets)
+
+
+def pulled_bar(speed: float, per_cell: int, courant: float = 0.3) -> tuple[Array, float, str]:
+    """Momentum of the right half of a bar whose ends fly apart, in initial ones, over time.
+
+    A bar that holds together comes back: its momentum changes sign.
+
+    Parameters
+    ----------
+    speed : float
+        Of the ends, in wave speeds.
+    per_cell : int
+
+    Returns
+    -------
+    (31,) array
+        Over 60 travel times of a wave through a cell.
+    float
+        Greatest stretch.
+    str
+        What the run says if it fails.
+    """
+    wave = Material().wave_speed
+    scene = Scene(
+        Grid((96, 12), 1.0),
+        time_step=courant / wave,
+        steps=round(60.0 / courant),
+        body=(Solid((40.0, 4.0), (56.0, 8.0)),),
+        particles_per_cell=per_cell,
+    )
+    particles = lay_out(scene)
+    state = at_rest(particles)
+    state[2] = speed * wave * (state[0] - 48.0) / 8.0
+    state[4] = speed * wave / 8.0
+    right = state[0] > 48.0
+    frames = np.linspace(0, scene.steps, 31).astype(int)
+    try:
+        states = solid(scene, particles, state).run(list(frames))
+    except SimulationError as error:
+        return np.full(31, np.nan), np.nan, str(error)
+    momentum = states[:, 2, right].sum(axis=1) / state[2, right].sum()
+    return momentum, stretch(states), ""
+
+
+def thrown(speed: float, courant: float = 0.3) -> tuple[int, int, str]:
+    """A block that flies to the right, with so many wave speeds, until it leaves the grid.
+
+    Returns
+    -------
+    int
+        Step in which the program notices.
+    int
+        Step before which its foremost particles pass half a cell from the edge.
+    str
+        What it says.
+    """
+    scene = Scene(
+        Grid((24, 16), 1.0),
+        time_step=courant / Material().wave_speed,
+        steps=10000,
+        body=(Solid((4.0, 4.0), (8.0, 8.0)),),
+    )
+    particles = lay_out(scene)
+    state = at_rest(particles)
+    state[2] = speed * scene.material.wave_speed
+    way = 23.5 - particles.position[:, 0].max()
+    expected = int(np.floor(way / (speed * courant))) + 1
+    try:
+        solid(scene, particles, state).run()
+    except SimulationError as error:
+        return error.step, expected, str(error)
+    return -1, expected, ""
+
+
+def measure(quick: bool) -> Found:
+    """Cuts through stretched bars, pulled bars, and blocks that leave the grid."""
+    found = Found()
+    found.tables["fracture_force"] = [
+        {"per_cell": n, "stretch": s, "weakest_cut": weakest_cut(s, n)}
+        for n in (2, 3)
+        for s in STRETCHES
+    ]
+    bars = found.tables["fracture_bar"] = []
+    for n in (2, 3):
+        for speed in SPEEDS:
+            momentum, longest, said_bar = pulled_bar(speed, n)
+            back = bool(np.nanmin(momentum) < -0.5) if not said_bar else False
+            bars.append(
+                {"per_cell": n, "speed": speed, "stretch": longest, "comes_back": back,
+                 "failure": said_bar, "least_momentum": float(np.min(momentum))}
+            )  # fmt: skip
+    torn = {
+        n: min(
+            (b["speed"] for b in bars if b["per_cell"] == n and not b["comes_back"]), default=np.inf
+        )
+        for n in (2, 3)
+    }
+    cuts = {(r["per_cell"], r["stretch"]): r["weakest_cut"] for r in found.tables["fracture_force"]}
+    found.lines.append(
+        Line(
+            "Numerical fracture, 2 (3) particles per cell and direction",
+            "stretch 2 (3): one particle a cell; stretch 4 (6): neighbours share no node",
+            f"weakest cut carries {cuts[2, 2.0]:.0%}, {cuts[2, 3.0]:.0%}, {abs(cuts[2, 4.0]):.0%} "
+            f"at stretch 2, 3, 4 ({cuts[3, 3.0]:.0%} and {abs(cuts[3, 6.0]):.0%} at 3 and 6); a "
+            f"pulled bar tears from {torn[2]:g} ({torn[3]:g}) c_p on",
+            "**Runs, and is wrong**: nothing is said.",
+        )
+    )
+    flights = found.tables["leaving"] = []
+    for speed in (0.11, 0.37, 1.01):
+        noticed, expected, text = thrown(speed)
+        flights.append({"speed": speed, "step": noticed, "expected": expected, "failure": text})
+    found.lines.append(
+        Line(
+            "Particles that leave the grid",
+            "noticed in step " + ", ".join(str(f["expected"]) for f in flights),
+            "noticed in step " + ", ".join(str(f["step"]) for f in flights),
+            "SimulationError with step, particle and place.",
+        )
+    )
+    return found

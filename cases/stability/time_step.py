@@ -1,0 +1,218 @@
+"""The time step over its limit: an isolated particle, bulk, free bodies, and fast spin."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import scipy.linalg
+
+from mpmopt import mpm
+from mpmopt.errors import SceneError, SimulationError
+from mpmopt.particles import Particles, lay_out
+from mpmopt.scene import Grid, Scene, Solid
+from stability.common import Array, Found, Line, at_rest, failure, largest, solid
+
+CELLS = 24
+# What the documentation calls safe: Courant number, and dt |C|.
+SAFE_COURANT, SAFE_TURN = 0.5, 0.35
+KICK = 1e-6  # velocity of a perturbation, in wave speeds
+
+
+def block_scene(cells: int = 6, steps: int = 2000) -> Scene:
+    """A square solid of so many cells, free in space; cells are one wide, the step is legal."""
+    low = (CELLS - cells) // 2
+    scene = Scene(
+        Grid((CELLS, CELLS), 1.0),
+        time_step=0.01,
+        steps=steps,
+        body=(Solid((low, low), (low + cells, low + cells)),),
+    )
+    return scene
+
+
+def linear_limit(
+    position: Array, mass: Array, volume: Array, stiffness: Array, period: int = 0
+) -> float:
+    """Courant number of the solid from which the step, linearised at rest, is unstable.
+
+    On the grid a step is u' = S u - dt M^-1 K q', q' = q + dt u: S is what the transfer to the
+    particles and back makes of velocities, K the stiffness between nodes. Its first eigenvalue
+    leaves the unit circle at -1, where dt^2 K u = 2 (M + M S) u.
+
+    Parameters
+    ----------
+    position : (N, 2) array
+        In cells.
+    mass, volume, stiffness : (N,) arrays
+        Mass and stiffness in those of the solid, with lambda = mu.
+    period : int, optional
+        Cells after which the body repeats itself along both axes; 0: it does not.
+    """
+    rows = period or int(position.max()) + 3
+    long = 10**4
+    nodes, weight = mpm.interpolation(position, 1.0, long)
+    column, row = np.divmod(nodes, long)
+    arm = np.stack([column - position[:, :1], row - position[:, 1:]], axis=-1)
+    node = column % rows * rows + row % rows
+    count = rows * rows
+    lumped, shared = np.zeros(count), np.zeros((count, count))
+    K = np.zeros((count, 2, count, 2))
+    one = np.eye(2)
+    for p, here in enumerate(node):
+        pair, dot = np.outer(weight[p], weight[p]), arm[p] @ arm[p].T
+        lumped[here] += mass[p] * weight[p]
+        shared[np.ix_(here, here)] += mass[p] * pair * (1.0 + 4.0 * dot)
+        tangent = (
+            np.einsum("ij,ab->iajb", dot, one)
+            + np.einsum("ib,ja->iajb", arm[p], arm[p])
+            + np.einsum("ia,jb->iajb", arm[p], arm[p])
+        )
+        K[np.ix_(here, (0, 1), here, (0, 1))] += (
+            16.0 * volume[p] * stiffness[p] * pair[:, None, :, None] * tangent
+        )
+    there = np.flatnonzero(lumped > 0.0)
+    K = K[np.ix_(there, (0, 1), there, (0, 1))].reshape(2 * there.size, -1)
+    inertia = np.diag(lumped[there]) + shared[np.ix_(there, there)]
+    greatest = scipy.linalg.eigh(K, np.kron(inertia, one), eigvals_only=True)[-1]
+    return float(np.sqrt(3.0) * np.sqrt(2.0 / greatest))  # c_p = sqrt(3) for lambda = mu = rho = 1
+
+
+def stays_small(scene: Scene, particles: Particles, mass: Array, courant: float) -> bool:
+    """Whether a small random motion does not grow."""
+    rng = np.random.default_rng(1)
+    state = at_rest(particles)
+    speed = scene.material.wave_speed
+    state[2:8] = KICK * speed * rng.uniform(-1.0, 1.0, state[2:8].shape)
+    dt = courant * scene.grid.dx / speed
+    simulation = solid(scene, particles, state, share={"mass": mass}, time_step=dt)
+    try:
+        return bool(np.abs(simulation.run()[2:8]).max() <= 3.0 * np.abs(state[2:8]).max())
+    except SimulationError:
+        return False
+
+
+def isolated(scene: Scene) -> Particles:
+    """One particle of the scene's body."""
+    return lay_out(scene).subset(np.arange(len(lay_out(scene).position)) == 0)
+
+
+def shifted(particles: Particles, by: float) -> Particles:
+    """The same particles elsewhere between the nodes."""
+    return Particles(
+        particles.position + by, particles.volume, particles.designed, particles.actuator
+    )
+
+
+def resting_limits(quick: bool) -> list[dict[str, Any]]:
+    """Limits of bodies at rest: linear theory beside what a small kick shows."""
+    steps = 1000 if quick else 4000
+    rows: list[dict[str, Any]] = []
+
+    def add(body: str, theory: float, holds: Callable[[float], bool]) -> None:
+        measured = largest(holds, 0.3, 3.0, 0.005)
+        rows.append({"body": body, "theory": theory, "measured": measured})
+
+    scene = block_scene(steps=steps)
+    one = isolated(scene)
+    ones = np.ones(1)
+    add(
+        "isolated particle",
+        linear_limit(one.position, ones, one.volume / one.volume, 1.0 * ones),
+        lambda c: stays_small(scene, one, ones, c),
+    )
+    for shift in (0.0, 0.25, 0.5) if quick else (0.0, 0.125, 0.25, 0.375, 0.5):
+        block = shifted(lay_out(scene), shift)
+        ones = np.ones(len(block.position))
+        add(
+            f"free block, {shift:g} cells from the grid",
+            linear_limit(block.position, ones, ones, ones),
+            lambda c, block=block, ones=ones: stays_small(scene, block, ones, c),
+        )
+    # A rim four times as heavy moves slowly and leaves what lies inside to itself.
+    large = block_scene(14, steps)
+    block = lay_out(large)
+    rim = np.any(np.abs(block.position - CELLS / 2) > 4.0, axis=1)
+    mass = np.where(rim, 4.0, 1.0)
+    patch = lay_out(block_scene(6)).position
+    ones = np.ones(len(patch))
+    add(
+        "bulk",
+        linear_limit(patch, ones, ones, ones, period=6),
+        lambda c: stays_small(large, block, mass, c),
+    )
+    return rows
+
+
+MOTIONS = {
+    "spin": (0.0, -1.0, 1.0, 0.0),
+    "squeeze": (-1.0, 0.0, 0.0, -1.0),
+    "dilate": (1.0, 0.0, 0.0, 1.0),
+    "shear": (0.0, 1.0, 0.0, 0.0),
+    "stretch": (1.0, 0.0, 0.0, -1.0),
+}
+# |C| in units of c_p / dx
+RATES = (0.03, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0)
+# Courant numbers at which an oscillation of the isolated particle takes 3 and 4 steps.
+RESONANCES = tuple(np.sqrt(0.75) * np.sin(np.pi / n) for n in (3, 4))
+
+
+def survives(motion: Array, rate: float, courant: float, steps: int = 3000) -> bool:
+    """Whether an isolated particle lives on that starts with |C| = rate c_p / dx."""
+    scene = block_scene(steps=steps)
+    one = isolated(scene)
+    state, speed = at_rest(one), scene.material.wave_speed
+    state[4:8, 0] = rate * speed / scene.grid.dx * np.asarray(motion) / np.linalg.norm(motion)
+    run = solid(scene, one, state, time_step=courant * scene.grid.dx / speed).run
+    return not failure(run)
+
+
+def moving_limits(quick: bool) -> list[dict[str, Any]]:
+    """Lowest Courant numbers at which an isolated particle in fast motion inverts."""
+    rows: list[dict[str, Any]] = []
+    courants = np.arange(0.1, 0.9, 0.02 if quick else 0.01)
+    for name, motion in MOTIONS.items():
+        for rate in RATES[::3] if quick else RATES:
+            fails = (c for c in courants if not survives(np.array(motion), rate, c))
+            first = next(fails, np.nan)
+            rows.append(
+                {"motion": name, "rate": rate, "measured": first, "dt_C": float(first * rate)}
+            )
+    return rows
+
+
+def measure(quick: bool) -> Found:
+    """Limits at rest and in motion, and what a scene says to a step that is too long."""
+    rest, motion = resting_limits(quick), moving_limits(quick)
+    scene = block_scene()
+    legal, said = scene.largest_time_step, ""
+    try:
+        replace(scene, time_step=1.001 * legal)
+    except SceneError as error:
+        said = type(error).__name__
+    by_body: dict[str, list[dict[str, Any]]] = {}
+    for row in rest:
+        by_body.setdefault(row["body"].split(",")[0], []).append(row)
+    refused = f"Refused from Courant {legal * scene.material.wave_speed:.3f} on: {said}."
+    lines = []
+    for body, rows in by_body.items():
+        theory, measured = ([row[key] for row in rows] for key in ("theory", "measured"))
+        lines.append(
+            Line(
+                f"Time step too long: {body}", f"{min(theory):.3f}", f"{min(measured):.3f}", refused
+            )
+        )
+    worst = {
+        rate: min(r["measured"] for r in motion if r["rate"] == rate)
+        for rate in dict.fromkeys(r["rate"] for r in motion)
+    }
+    lines.append(
+        Line(
+            "Time step too long: isolated particle that spins or is strained fast",
+            f"resonances of order 3 and 4: {RESONANCES[0]:.3f}, {RESONANCES[1]:.3f}",
+            ", ".join(f"{first:.2f} at {rate:g}" for rate, first in worst.items())
+            + " (rate in c_p / dx)",
+            "The particle inverts: SimulationError.",
+        )
+    )
+    return Found({"time_step_rest": rest, "time_step_motion": motion}, lines)

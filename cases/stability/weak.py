@@ -1,0 +1,179 @@
+"""Weak particles beside stressed solid: random designs over Courant number and floors."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from crawler import crawler
+from walker import walker
+
+from mpmopt.actuation import signal
+from mpmopt.binary import distance
+from mpmopt.design import interpolate
+from mpmopt.errors import SceneError, SimulationError
+from mpmopt.objective import Objective
+from mpmopt.particles import lay_out
+from mpmopt.problem import Variables
+from mpmopt.scene import Grid, Material, Scene
+from mpmopt.simulate import Simulation
+from stability.common import Array, Found, Line
+from stability.time_step import block_scene, linear_limit
+
+EPSILONS = tuple(10.0**-k for k in range(1, 7))
+COURANTS = (0.14, 0.25, 0.35, 0.5, 0.6, 0.7, 0.8)
+HEAVY = 1e-2  # the mass floor that is the cure
+SAFE_STIFFNESS = 1e-3
+GAIN = 0.25  # of an optimised walker: deviations are judged by it
+
+
+def roomy_walker(cells: int, time_step: float) -> Scene:
+    """The walker on a floor twice as long, so that no loose piece finds its end."""
+    scene, c = walker(cells, time_step), 16 / 64
+    body = tuple(
+        replace(
+            part, lower=(part.lower[0] + c, part.lower[1]), upper=(part.upper[0] + c, part.upper[1])
+        )
+        for part in scene.body
+    )
+    return replace(scene, grid=Grid((2 * cells, cells), 1 / cells), body=body)
+
+
+CASES = {"walker": roomy_walker, "crawler": crawler}
+
+
+def courant_scene(
+    case: str, courant: float, cells: int = 64, material: Material | None = None
+) -> Scene:
+    """A case whose Courant number is at most so much."""
+    material = material or Material()
+    steps = math.ceil(material.wave_speed * cells / courant)
+    return replace(CASES[case](cells, 1.0 / steps), material=material)
+
+
+def patches(positions: Array, seed: int) -> np.ndarray:
+    """A random drawing of void and solid: which of the particles at (D, 2) are there."""
+    rng = np.random.default_rng(seed)
+    waves = rng.normal(scale=60.0, size=(2, 30))
+    return np.cos(positions @ waves + rng.uniform(0.0, 2.0 * np.pi, 30)).sum(axis=1) > -1.0
+
+
+def actuation(seed: int) -> Variables:
+    """Full amplitude, random phase and bias."""
+    theta, b = np.random.default_rng(1000 + seed).uniform(-1.0, 1.0, (2, 1))
+    return Variables(np.zeros(0), np.ones(1), theta, b)
+
+
+def with_void(scene: Scene, there: np.ndarray, variables: Variables) -> float:
+    """Objective of a drawn design whose void is simulated too.
+
+    Raises
+    ------
+    SimulationError
+        If the simulation fails.
+    """
+    particles = lay_out(scene)
+    gamma = np.ones(len(particles.position))
+    gamma[particles.designed] = there
+    given = signal(scene, variables.a, variables.theta, variables.b)
+    simulation = Simulation(scene, particles, *interpolate(scene.material, gamma), given)
+    return float(Objective.of(particles, scene.direction).value(simulation.run()))
+
+
+def floors(epsilon: float, heavy: bool) -> Material:
+    """Both floors equal, or a heavy one for mass."""
+    return Material(stiffness_floor=epsilon, mass_floor=HEAVY if heavy else epsilon)
+
+
+def limit_at_rest(material: Material) -> float:
+    """Courant number from which an undeformed block of solid within void is unstable.
+
+    Void is a frame one cell wide. The worst of several places between the nodes.
+    """
+    position = lay_out(block_scene(8)).position
+    void = np.any(np.abs(position - 12.0) > 3.0, axis=1)
+    mass = np.where(void, material.mass_floor, 1.0)
+    stiffness = np.where(void, material.stiffness_floor, 1.0)
+    ones = np.ones(len(position))
+    return min(linear_limit(position + shift, mass, ones, stiffness) for shift in (0.0, 0.25, 0.5))
+
+
+def one_square(case: str, courant: float, material: Material, seeds: range) -> dict[str, Any]:
+    """Random designs with void, each against the same body without it."""
+    row: dict[str, Any] = {
+        "case": case, "courant": courant, "stiffness_floor": material.stiffness_floor,
+        "mass_floor": material.mass_floor, "refused": False, "designs": 0, "failed": 0,
+        "median_deviation": np.nan, "largest_deviation": np.nan, "error": "",
+    }  # fmt: skip
+    try:
+        scene = courant_scene(case, courant, material=material)
+    except SceneError as error:
+        return row | {"refused": True, "error": str(error)}
+    particles = lay_out(scene)
+    away = []
+    for seed in seeds:
+        there, variables = patches(particles.position[particles.designed], seed), actuation(seed)
+        alone = distance(scene, there, variables)
+        row["designs"] += 1
+        try:
+            away.append(abs(with_void(scene, there, variables) - alone))
+        except SimulationError as error:
+            row["failed"] += 1
+            row["error"] = str(error)
+    if away:
+        row["median_deviation"], row["largest_deviation"] = np.median(away), max(away)
+    return row
+
+
+def squares(quick: bool) -> Iterator[dict[str, Any]]:
+    """The map: case by case, floors and Courant numbers."""
+    epsilons = EPSILONS[::2] + EPSILONS[-1:] if quick else EPSILONS
+    courants = COURANTS[2::2] if quick else COURANTS
+    for case in CASES:
+        for heavy in (False, True):
+            for epsilon in epsilons:
+                if heavy and epsilon == HEAVY:  # is among the equal ones
+                    continue
+                for courant in courants:
+                    yield one_square(
+                        case, courant, floors(epsilon, heavy), range(2 if quick else 8)
+                    )
+
+
+def measure(quick: bool) -> Found:
+    """The map, and how it sums up for equal floors and for a heavy mass floor."""
+    rows = list(squares(quick))
+    lines = []
+    for heavy in (False, True):
+        mine = [r for r in rows if (r["mass_floor"] == HEAVY) is heavy or not heavy]
+        mine = [r for r in mine if heavy or r["mass_floor"] == r["stiffness_floor"]]
+        ran = [r for r in mine if not r["refused"]]
+        failed = [r for r in ran if r["failed"]]
+        runs = sum(r["designs"] for r in ran)
+        at_rest_limits = [
+            limit_at_rest(floors(e, heavy)) for e in EPSILONS if not (heavy and e > HEAVY)
+        ]
+        theory = f"linearised step at rest: {min(at_rest_limits):.2f} to {max(at_rest_limits):.2f}"
+        if failed:
+            first = min(failed, key=lambda r: (r["courant"], -r["stiffness_floor"]))
+            measured = (
+                f"{sum(r['failed'] for r in failed)} of {runs} runs fail, the first at Courant "
+                f"{first['courant']:g} with floors of {first['stiffness_floor']:.0e}"
+            )
+        else:
+            measured = f"0 of {runs} runs fail, up to Courant {max(r['courant'] for r in ran):g}"
+        weak = [r["largest_deviation"] for r in ran if r["stiffness_floor"] <= SAFE_STIFFNESS]
+        measured += (
+            f"; with floors of {SAFE_STIFFNESS:g} or less void moves the objective by at most "
+            f"{np.nanmax(weak):.4f}"
+        )
+        name = f"mass floor {HEAVY:g}" if heavy else "floors of mass and stiffness equal"
+        refused = sum(r["refused"] for r in mine)
+        program = "SimulationError: inverted, or left the grid." if failed else ""
+        if refused:
+            program += f" {refused} of {len(mine)} squares are refused: SceneError."
+        lines.append(
+            Line(f"Weak particles beside stressed solid, {name}", theory, measured, program.strip())
+        )
+    return Found({"weak": rows}, lines)
