@@ -287,7 +287,7 @@ def test_a_module_becomes_tables_and_a_summary():
 @pytest.mark.slow
 def test_the_case_writes_a_table_for_each_map_a_summary_and_a_figure(tmp_path, capsys):
     assert stability_map.main(["--out", str(tmp_path), "--quick"]) == 0
-    assert capsys.readouterr().out.count(" s\n") == len(stability_map.MODULES)
+    assert capsys.readouterr().out.count(" of them at work\n") == len(stability_map.MODULES)
     names = {path.name for path in tmp_path.iterdir()}
     assert {"stability.rst", "stability_map.png", "stability_weak.csv"} <= names
     assert (tmp_path / "stability_map.png").stat().st_size > 50_000

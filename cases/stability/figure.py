@@ -134,7 +134,7 @@ def ellipticity(axes: Axes, tables: Tables) -> None:
     axes.axvline(1.0, **LIMIT)
     axes.axvspan(0.0, STRENGTH, **SAFE)
     axes.axvspan(1.0, 1.1, color=FAILED, alpha=0.08, lw=0)
-    note(axes, 1.01, 0.5, "refused:\nellipticity\nlost")
+    note(axes, 1.01, 0.31, "refused:\nellipticity\nlost", va="top")
     axes.set_xlim(0.0, 1.12)
     axes.set_xlabel("largest signal x actuation stress / $\\mu$")
     axes.set_ylabel("distance of a walker")
@@ -241,8 +241,9 @@ def sizes(axes: Axes, tables: Tables) -> None:
         if np.isfinite(error).any():
             axes.loglog(steps, error, "x:", color=colour, label=f"single, relative, {name}")
     axes.set_xlabel("steps")
+    axes.set_ylim(1e-6, 1.0)
     axes.set_title("Gradient over the horizon")
-    axes.legend(fontsize=6)
+    axes.legend(fontsize=6, loc="upper left")
 
 
 def radii(axes: Axes, tables: Tables) -> None:
