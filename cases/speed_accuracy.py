@@ -283,9 +283,10 @@ def peer_point(name: str, robot: str) -> Point:
         raise SystemExit(f"{name} failed:\n{done.stderr[-2000:]}")
     result = json.loads(done.stdout.splitlines()[-1])
     scene = ROBOTS[robot][0]
+    gradient = np.array(result["gradient"])
     measured = Measured(
-        Discretisation.of(scene), result["seconds"], result["megabytes"], result["travel"],
-        np.array(result["gradient"]),
+        Discretisation.of(scene), result["seconds"], result["megabytes"], result["travel"], gradient,
+        "" if np.all(np.isfinite(gradient)) else "its gradient is not a number",
     )  # fmt: skip
     print(f"{robot}, {name}: {measured.seconds:.2f} s", file=sys.stderr, flush=True)
     return Point(robot, PAPER[0], scene.steps, scene.courant, name, measured)
