@@ -144,11 +144,14 @@ class Measured:
             return math.nan, math.nan, math.nan
         one, other = self.gradient, reference.gradient
         lengths = float(np.linalg.norm(one)), float(np.linalg.norm(other))
-        cosine = float(one @ other) / (lengths[0] * lengths[1]) if all(lengths) else math.nan
+        travel = abs(self.travel / reference.travel - 1.0)
+        if not all(lengths):
+            return travel, math.nan, math.nan
+        cosine = float(one @ other) / (lengths[0] * lengths[1])
         return (
-            abs(self.travel / reference.travel - 1.0),
-            float(np.linalg.norm(one - other)) / lengths[1] if lengths[1] else math.nan,
-            math.degrees(math.acos(min(1.0, max(-1.0, cosine)))) if all(lengths) else math.nan,
+            travel,
+            float(np.linalg.norm(one - other)) / lengths[1],
+            math.degrees(math.acos(min(1.0, max(-1.0, cosine)))),
         )
 
 
