@@ -79,7 +79,9 @@ def project(phi: NDArray, beta: float) -> NDArray:
 
 def project_adjoint(phi: NDArray, beta: float, gamma_bar: NDArray) -> NDArray:
     """phi_bar from gamma_bar."""
-    return gamma_bar * 0.5 * beta / np.tanh(beta) * (1.0 - np.tanh(beta * phi) ** 2)
+    decay = np.exp(-np.abs(beta * phi))
+    sech = 2.0 * decay / (1.0 + decay**2)  # 1 - tanh^2 = sech^2, which does not cancel
+    return gamma_bar * 0.5 * beta / np.tanh(beta) * sech**2
 
 
 def greyness(gamma: NDArray) -> float:

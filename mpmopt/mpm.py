@@ -382,14 +382,15 @@ def find_window(state, world, first, last):
 
 
 @jit
-def margins(state, body, world, first, last):
+def margins(state, body, world, solid, first, last):
     """How close groups of particles come to where a step is too long, as in `simulate.Margins`.
 
-    The largest (dt / dx) sqrt(M / rho) and dt |C|, and the smallest J; M is the stiffness of a
-    particle as stretched as it is, ``lambda + mu tr b + sqrt(mu^2 (tr^2 b - 4 det b) + lambda^2)``
-    with b = F F^T. Extremes do not depend on the order in which they are taken.
+    The largest (dt / dx) sqrt(M / rho) and dt |C|, the smallest J, and the largest stretch of
+    particles whose mu is at least `solid`; M is the stiffness of a particle as stretched as it is,
+    ``lambda + mu tr b + sqrt(mu^2 (tr^2 b - 4 det b) + lambda^2)`` with b = F F^T. Extremes do not
+    depend on the order in which they are taken.
     """
-    stiffest = fastest = 0.0
+    stiffest = fastest = longest = 0.0
     smallest = math.inf
     for g in range(first, last):
         for k in range(4):
@@ -402,12 +403,15 @@ def margins(state, body, world, first, last):
                 f10, f11 = state[12 * g + 10, k].real, state[12 * g + 11, k].real
                 J = f00 * f11 - f01 * f10
                 trace = f00 * f00 + f01 * f01 + f10 * f10 + f11 * f11
-                apart = mu * mu * max(trace * trace - 4.0 * J * J, 0.0)
-                stiffness = lam + mu * trace + math.sqrt(apart + lam * lam)
+                apart = max(trace * trace - 4.0 * J * J, 0.0)
+                stiffness = lam + mu * trace + math.sqrt(mu * mu * apart + lam * lam)
+                if mu >= solid:
+                    longest = max(longest, 0.5 * (trace + math.sqrt(apart)))
                 stiffest = max(stiffest, stiffness * volume / mass)
                 fastest = max(fastest, c00 * c00 + c01 * c01 + c10 * c10 + c11 * c11)
                 smallest = min(smallest, J)
-    return world.dt / world.dx * math.sqrt(stiffest), world.dt * math.sqrt(fastest), smallest
+    courant, spin = world.dt / world.dx * math.sqrt(stiffest), world.dt * math.sqrt(fastest)
+    return courant, spin, smallest, math.sqrt(longest)
 
 
 @jit

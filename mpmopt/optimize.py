@@ -207,7 +207,7 @@ class Iteration:
         L without void, or not a number if the stage does not ask for it or it failed.
     redone : int
         How often the stage's time step was halved for this evaluation.
-    courant, spin, jacobian : float
+    courant, spin, jacobian, stretch : float
         Its `simulate.Margins`, or not a number if it failed.
     failure : str
         Why the evaluation failed, or empty.
@@ -230,6 +230,7 @@ class Iteration:
     courant: float = np.nan
     spin: float = np.nan
     jacobian: float = np.nan
+    stretch: float = np.nan
     failure: str = ""
 
 
@@ -466,7 +467,7 @@ class _StageRun:
         run = self.run
         value, failure = np.nan, ""
         gradient: NDArray[np.float64] = np.full(x.size, np.nan)
-        problem, redone, margins = self.problem, self.problem.redo, Margins(*3 * (np.nan,))
+        problem, redone, margins = self.problem, self.problem.redo, Margins(*4 * (np.nan,))
         time_step = problem.scene.time_step / 2.0**redone
         try:
             evaluation = problem.evaluate(x)
@@ -502,6 +503,7 @@ class _StageRun:
             courant=margins.courant,
             spin=margins.spin,
             jacobian=margins.jacobian,
+            stretch=margins.stretch,
             failure=failure,
         )
         run.history.append(iteration)

@@ -24,8 +24,9 @@ from mpmopt.simulate import Margins, Memory, Precision, Simulation
 
 logger = logging.getLogger(__name__)
 
-# An evaluation that goes beyond these is not trusted (docs: theory, "Step control").
-LIMITS = Margins(courant=1.0, spin=0.5, jacobian=0.01)
+# An evaluation that goes beyond these is not trusted (docs: theory, "Step control"); the stretch is
+# over the particles per cell and direction.
+LIMITS = Margins(courant=1.0, spin=0.5, jacobian=0.01, stretch=1.5)
 
 
 class Variables(NamedTuple):
@@ -301,6 +302,14 @@ class Problem:
         ):
             if not value <= limit:
                 raise _too_long(simulation, f"{what} reached {value:.3g}, the limit is {limit:.3g}")
+        limit = LIMITS.stretch * self.scene.particles_per_cell
+        if not margins.stretch <= limit:
+            raise _failed(
+                simulation,
+                f"solid is stretched {margins.stretch:.3g} times, beyond {limit:.3g} it is torn",
+                "take more particles per cell (now "
+                f"{self.scene.particles_per_cell}), a stiffer body or weaker actuation",
+            )
 
 
 def _real(name: str, value: Any) -> NDArray[np.float64]:
@@ -322,4 +331,9 @@ def _finite(values: Any, simulation: Simulation) -> Any:
 def _too_long(simulation: Simulation, what: str) -> SimulationError:
     """What the step is too long for, as an error about the whole body."""
     hint = f"take a smaller time step (now {simulation.scene.time_step:g})"
+    return _failed(simulation, what, hint)
+
+
+def _failed(simulation: Simulation, what: str, hint: str) -> SimulationError:
+    """A failure of the whole body."""
     return SimulationError(what, simulation.steps, -1, (np.nan, np.nan), hint)

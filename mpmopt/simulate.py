@@ -75,11 +75,15 @@ class Margins(NamedTuple):
         Largest dt |C|, the Frobenius norm. Below 1 no particle can be inverted by a step.
     jacobian : float
         Smallest J = det F.
+    stretch : float
+        Largest singular value of F among particles with half the solid's stiffness or more. Solid
+        is torn where it exceeds the particles per cell and direction by far.
     """
 
     courant: float = 0.0
     spin: float = 0.0
     jacobian: float = math.inf
+    stretch: float = 0.0
 
     def join(self, other: Margins) -> Margins:
         """The margins of two runs, or of two parts of a run, taken together."""
@@ -87,6 +91,7 @@ class Margins(NamedTuple):
             max(self.courant, other.courant),
             max(self.spin, other.spin),
             min(self.jacobian, other.jacobian),
+            max(self.stretch, other.stretch),
         )
 
 
@@ -246,7 +251,8 @@ class Simulation:
 
     def margins(self, records: NDArray) -> Margins:
         """Those of a state, as records of groups of particles (`mpm.grouped`)."""
-        found = mpm.margins(records, self.body, self.world, 0, len(self.body.mass))
+        solid = 0.5 * self.scene.material.lame_mu
+        found = mpm.margins(records, self.body, self.world, solid, 0, len(self.body.mass))
         return Margins(*(float(value) for value in found))
 
     @property

@@ -1,13 +1,21 @@
 """Filter, projection, interpolation."""
 
 import dataclasses
+import math
 
 import numpy as np
 import pytest
 from conftest import small_scene
 from walker import walker
 
-from mpmopt.design import DesignChain, filter_matrix, greyness, interpolate, project
+from mpmopt.design import (
+    DesignChain,
+    filter_matrix,
+    greyness,
+    interpolate,
+    project,
+    project_adjoint,
+)
 from mpmopt.errors import DesignError
 from mpmopt.particles import lay_out
 from mpmopt.scene import Design, Grid, Material, Scene, Solid
@@ -156,3 +164,11 @@ def test_a_body_without_design_domain_has_no_variables_to_filter():
     chain = DesignChain(scene, lay_out(scene), 1.0)
     assert chain.gamma(np.zeros(0)).shape == (0,)
     assert np.all(chain.material(np.zeros(0))[0] == 1.0)
+
+
+@pytest.mark.parametrize("beta", [1.0, 16.0, 32.0])
+def test_the_slope_of_the_projection_keeps_its_digits_where_it_saturates(beta):
+    # d gamma / d phi = beta / (2 tanh beta cosh^2 beta phi), which 1 - tanh^2 would cancel to zero.
+    phi = np.array([-1.0, 0.7, 1.0])
+    exact = [beta / (2.0 * math.tanh(beta) * math.cosh(beta * p) ** 2) for p in phi]
+    assert project_adjoint(phi, beta, np.ones(3)) == pytest.approx(exact, rel=1e-13)

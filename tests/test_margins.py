@@ -5,14 +5,14 @@ import dataclasses
 import numpy as np
 import pytest
 from conftest import small_scene, worst
-from walker import walker
+from walker import slanted_legs, walker
 
 from mpmopt import mpm
 from mpmopt.checkpoints import Checkpointing
 from mpmopt.errors import DesignError, SimulationError
 from mpmopt.optimize import Settings, Stage, optimise
 from mpmopt.problem import LIMITS, Problem
-from mpmopt.scene import Design, Material, Solid, Wall
+from mpmopt.scene import Actuator, Design, Material, Solid, Wall
 from mpmopt.simulate import WATCH, Margins
 from mpmopt.verify import COMPLEX_STEP, COMPLEX_TOLERANCE, complex_step_test
 
@@ -30,7 +30,7 @@ def stiffness(F, mu, lame_lambda):
 def watched(scene, particles, states, mass, mu, lame_lambda):
     """Margins of some states, particle by particle."""
     dt, dx = scene.time_step, scene.grid.dx
-    courant, spin, jacobian = [], [], []
+    courant, spin, jacobian, stretch = [], [], [], [0.0]
     for state in states:
         for p in range(state.shape[1]):
             C, F = state[4:8, p].reshape(2, 2), state[8:12, p].reshape(2, 2)
@@ -38,7 +38,9 @@ def watched(scene, particles, states, mass, mu, lame_lambda):
             courant.append(dt / dx * np.sqrt(speed))
             spin.append(dt * np.linalg.norm(C))
             jacobian.append(np.linalg.det(F))
-    return Margins(max(courant), max(spin), min(jacobian))
+            if mu[p] >= 0.5 * scene.material.lame_mu:
+                stretch.append(np.linalg.norm(F, 2))
+    return Margins(max(courant), max(spin), min(jacobian), max(stretch))
 
 
 def lively(**changes):
@@ -77,9 +79,28 @@ def test_an_undeformed_body_is_at_its_scenes_limit(scene):
     scene = scene.vary(mass_floor=1e-3)
     problem = Problem(scene, redo=0)
     simulation = problem.simulation(problem.join(1.0, 0.0, 0.0, 0.0))
-    courant, spin, jacobian = simulation.margins(mpm.grouped(simulation.initial))
-    assert courant == pytest.approx(scene.time_step / scene.largest_time_step, rel=1e-12)
-    assert (spin, jacobian) == (0.0, 1.0)
+    margins = simulation.margins(mpm.grouped(simulation.initial))
+    courant = scene.time_step / scene.largest_time_step
+    assert margins == pytest.approx(Margins(courant, 0.0, 1.0, 1.0), rel=1e-12)
+
+
+def test_solid_that_is_torn_is_an_error_and_no_distance():
+    # Just below where ellipticity is lost; at 0.95 of that distances are 0.42 or 0.57 by the step.
+    scene = walker(64, 8e-4)
+    stress = 0.99 * scene.material.lame_mu / 2.0 * np.eye(2)
+    body = tuple(
+        dataclasses.replace(part, stress=stress) if isinstance(part, Actuator) else part
+        for part in scene.body
+    )
+    problem = Problem(dataclasses.replace(scene, body=body), 8.0, leave_out=0.05, redo=1)
+    positions = problem.particles.position[problem.particles.designed]
+    x = problem.join(np.where(slanted_legs(positions), 1.0, -1.0), 1.0, -0.3, -1.0)
+    with pytest.raises(SimulationError, match=r"solid is stretched .* more particles per cell"):
+        problem.value(x)
+    with pytest.raises(SimulationError, match=r"solid is stretched .* more particles per cell"):
+        problem.value_and_gradient(x)
+    gentle = Problem(scene, 8.0, leave_out=0.05, redo=1).evaluate(x)
+    assert 1.0 < gentle.margins.stretch <= LIMITS.stretch * scene.particles_per_cell
 
 
 # Scenes that provoke each of the three, and what they reach in their own step.
@@ -211,7 +232,8 @@ def test_an_optimisation_records_steps_and_margins():
         assert (item.redone, item.time_step) == (1, scene.time_step / 2)
         again = plain(problem, item.time_step).evaluate(item.x)
         assert again.value == item.objective
-        assert again.margins == (item.courant, item.spin, item.jacobian)
+        margins = item.courant, item.spin, item.jacobian, item.stretch
+        assert again.margins == margins
     assert run.problem().scene.time_step == scene.time_step / 2
     assert run.problem().value(run.result.x) == run.result.objective
     off = dataclasses.replace(settings, stages=(dataclasses.replace(stage, redo=0),))
