@@ -98,15 +98,9 @@ class Discretisation:
             mirror=self.mirror,
         )
 
-    def problem(
-        self,
-        scene: Scene,
-        beta: float,
-        leave_out: float = 0.0,
-        checkpointing: Checkpointing | None = None,
-    ) -> Problem:
-        """The `Problem` of the scene in this discretisation."""
-        return Problem(self.scene(scene), beta, checkpointing, leave_out, precision=self.precision)
+    def problem(self, scene: Scene, beta: float, **options: Any) -> Problem:
+        """The `Problem` of the scene in this discretisation, with further options of it."""
+        return Problem(self.scene(scene), beta, precision=self.precision, **options)
 
 
 @dataclass(frozen=True)
@@ -207,6 +201,7 @@ def measure(
     *,
     leave_out: float = 0.0,
     checkpointing: Checkpointing | None = None,
+    redo: int = 0,
     repeats: int = 1,
 ) -> Measured:
     """Objective and gradient of a design in one discretisation, and their cost.
@@ -217,8 +212,8 @@ def measure(
     discretisation : Discretisation
     design : callable
         From a `Problem` to its variables.
-    beta, leave_out, checkpointing
-        As in `Problem`.
+    beta, leave_out, checkpointing, redo
+        As in `Problem`; but an evaluation that was redone is a failure, as it is of another step.
     patch : float
         Width of the squares over which the gradient is summed (`density`).
     repeats : int, optional
@@ -230,24 +225,29 @@ def measure(
         A scene that cannot be, or a simulation that fails, says so there.
     """
     try:
-        problem = discretisation.problem(scene, beta, leave_out, checkpointing)
+        problem = discretisation.problem(
+            scene, beta, leave_out=leave_out, checkpointing=checkpointing, redo=redo
+        )
         x = design(problem)
         simulation = problem.simulation(x)
         start = float(problem.objective(simulation).value(simulation.initial))
         with simulation.checkpoints(problem.checkpointing) as store:
             schedule = store.schedule
         _compile(discretisation.precision)
-        (value, gradient), seconds = timed(lambda: problem.value_and_gradient(x), repeats)
+        evaluation, seconds = timed(lambda: problem.evaluate(x), repeats)
     except (SceneError, SimulationError) as error:
         return Measured(discretisation, failure=str(error))
+    if evaluation.redone:
+        step = problem.scene.time_step
+        return Measured(discretisation, failure=f"too close to failure: step {step:g} was halved")
     numbers = (schedule.segment + 1) * schedule.step_bytes
     stored = schedule.stored_bytes if schedule.in_memory else 0
     return Measured(
         discretisation,
         seconds,
         (numbers + stored) / 1e6,
-        value - start,
-        density(problem, gradient, patch, discretisation.mirror or scene.mirror),
+        evaluation.value - start,
+        density(problem, evaluation.gradient, patch, discretisation.mirror or scene.mirror),
     )
 
 
@@ -361,8 +361,9 @@ def cheapest(
     largest Courant number up to 0.4 that does not fail, are the reference. The others are measured
     in order of their work, particles times steps, until one is within the tolerance and its
     neighbour with the next finer cells is too, so that no error that only happens to vanish is
-    taken for accuracy. Single precision is tried where double suffices; one half is simulated where
-    scene and design are symmetric. The filter keeps the scene's length.
+    taken for accuracy. What would be redone with half the step counts as failed. Single precision
+    is tried where double suffices; one half is simulated where scene and design are symmetric. The
+    filter keeps the scene's length.
 
     Parameters
     ----------
@@ -404,7 +405,7 @@ def cheapest(
 
     def result(item: Discretisation) -> Measured:
         if item not in found:
-            found[item] = measure(scene, item, design, beta, patch, leave_out=leave_out)
+            found[item] = measure(scene, item, design, beta, patch, leave_out=leave_out, redo=1)
         return found[item]
 
     own = Discretisation.of(scene, mirror=plane)
