@@ -1,11 +1,11 @@
 """Damping by the transfer to the grid and back: with the step, and with the blend of a scene.
 
-    python cases/dissipation.py --out DIR [--quick]
+    python cases/dissipation.py --out DIR [--quick] [--runs RUN.h5 ...]
 
 The affine transfer damps once in every step, so that a smaller step damps more; with a `blend_time`
 damping becomes a rate. Measured on four motions, each with steps that differ by a factor of eight:
 the travel of the two robots drawn by hand, a spinning disc, a bar that vibrates freely, two discs
-that collide.
+that collide; and the best designs of runs, without their void.
 """
 
 import argparse
@@ -20,7 +20,8 @@ import crawler
 import numpy as np
 import walker
 
-from mpmopt.binary import distance
+from mpmopt import runfile
+from mpmopt.binary import THRESHOLD, distance
 from mpmopt.case import START
 from mpmopt.particles import Particles, lay_out
 from mpmopt.problem import Variables
@@ -47,6 +48,15 @@ def travel(case, blend_time: float, halvings: int) -> float:
     signal = Variables(np.zeros(0), *(np.array([START[name]]) for name in ("a", "theta", "b")))
     start = distance(replace(scene, steps=1), keep, signal)
     return distance(scene, keep, signal) - start
+
+
+def designed(path: Path, blend_time: float, halvings: int) -> float:
+    """How far the best design of a run goes without its void."""
+    run = runfile.read(path)
+    problem, x = run.problem(), run.best
+    scene = replace(problem.scene.vary(time_step=8e-4 / 2**halvings), blend_time=blend_time)
+    keep, signal = problem.gamma(x) >= THRESHOLD, problem.split(x)
+    return distance(scene, keep, signal) - distance(replace(scene, steps=1), keep, signal)
 
 
 def moving(scene: Scene, particles: Particles, velocity: np.ndarray, slope: np.ndarray):
@@ -141,11 +151,16 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of results")
     parser.add_argument("--quick", action="store_true", help="three blend times, two steps")
+    parser.add_argument("--runs", nargs="*", type=Path, default=[], metavar="RUN.h5")
     arguments = parser.parse_args()
     blend_times = BLEND_TIMES[::2] if arguments.quick else BLEND_TIMES
     halvings = HALVINGS[:2] if arguments.quick else HALVINGS
+    motions = {
+        f"travel of {path}": lambda tau, k, path=path: designed(path, tau, k)
+        for path in arguments.runs
+    }
     rows = []
-    for name, motion in MOTIONS.items():
+    for name, motion in {**MOTIONS, **motions}.items():
         for blend_time in blend_times:
             began = time.process_time()
             values = np.array([motion(blend_time, k) for k in halvings])
