@@ -41,6 +41,10 @@ class SimulationError(MpmoptError, ArithmeticError):
         return f"step {self.step}, {where}: {self.what}; {self.hint}"
 
 
+class TornError(SimulationError):
+    """Solid stretched so far that nothing holds its particles together; no step mends that."""
+
+
 class StorageError(MpmoptError, OSError):
     """A file that could not be written or read back, or a disk without room for it."""
 

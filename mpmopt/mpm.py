@@ -7,7 +7,7 @@ A step advances the particle states from t_n to t_n + dt (primes mark the new st
                  A   = m C - dt V c tau
     p2g          m_i = sum_p w_ip m,   q_i = sum_p w_ip (m v + A (x_i - x))
     mirror       adds the images across a plane of symmetry, if the scene has one
-    grid_update  u_i = wall(q_i / m_i + dt g)
+    grid_update  u_i = wall(q_i / m_i + dt g), where m_i > 0
     g2p          v'  = sum_i w_ip u_i,  C' = c sum_i w_ip u_i (x_i - x)^T,  x' = x + dt v'
     blend        v' += keep (v - sum_i w_ip u_i_old), if the scene asks for it
 
@@ -91,6 +91,7 @@ class World(NamedTuple):
     mirror_axis: int  # of the mirror plane's normal: 0 or 1; -1: no mirror
     mirror_node: int  # line of nodes that is the plane
     keep: float  # share of what the grid smoothed away that particles keep; 0: no blend
+    dust: float  # mass of a node that is rounding of larger ones: the node is empty
 
 
 class Body(NamedTuple):
@@ -762,7 +763,7 @@ def grid_update(grid, window, world, velocity, a):
         node = a * nj + b
         m = grid[0, node, 2]
         u = v = 0.0 * m
-        if m.real > 0.0:
+        if m.real > world.dust:
             per_m = 1.0 / m
             u = grid[0, node, 0] * per_m + world.dt * world.gravity_x
             v = grid[0, node, 1] * per_m + world.dt * world.gravity_y
@@ -770,7 +771,7 @@ def grid_update(grid, window, world, velocity, a):
         velocity[0, 2 * node], velocity[0, 2 * node + 1] = u, v
         if world.keep > 0.0:
             u = v = 0.0 * m
-            if m.real > 0.0:
+            if m.real > world.dust:
                 per_m = 1.0 / grid[1, node, 2]
                 u, v = grid[1, node, 0] * per_m, grid[1, node, 1] * per_m
             velocity[1, 2 * node], velocity[1, 2 * node + 1] = u, v
@@ -783,7 +784,7 @@ def grid_update_adjoint(grid, window, world, velocity_bar, node_bar, a):
     for b in range(nj):
         node = a * nj + b
         m = grid[0, node, 2]
-        if m > 0.0:
+        if m > world.dust:
             per_m = 1.0 / m
             u, v = grid[0, node, 0] * per_m, grid[0, node, 1] * per_m
             u_bar, v_bar = wall_adjoint(
@@ -1115,7 +1116,7 @@ def grouped(array: NDArray, repeat: bool = True) -> NDArray:
 def ungrouped(records: NDArray, rows: int, particles: int) -> NDArray:
     """The inverse of `grouped`: (rows, particles)."""
     filled = records.reshape(-1, rows, 4).swapaxes(0, 1).reshape(rows, -1)
-    return np.ascontiguousarray(filled[:, :particles])
+    return filled[:, :particles].copy()
 
 
 # Records of four numbers, of a node or one number of four particles in a row, and pairs. These

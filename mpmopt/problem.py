@@ -16,7 +16,7 @@ from mpmopt.actuation import signal, signal_adjoint
 from mpmopt.checkpoints import Checkpointing
 from mpmopt.checks import count, share
 from mpmopt.design import DesignChain
-from mpmopt.errors import DesignError, SimulationError
+from mpmopt.errors import DesignError, SimulationError, TornError
 from mpmopt.objective import Objective
 from mpmopt.particles import lay_out, nearest_designed
 from mpmopt.scene import Scene
@@ -259,6 +259,8 @@ class Problem:
         for redone in range(self.redo + 1):
             try:
                 return dataclasses.replace(evaluate(problem), redone=redone)
+            except TornError:
+                raise
             except SimulationError as error:
                 if redone == self.redo:
                     raise
@@ -276,14 +278,24 @@ class Problem:
     def _value_and_gradient(self, x: NDArray[np.float64]) -> Evaluation:
         phi, a, theta, _ = self.split(x)
         simulation = self.simulation(x)
-        memory = self._memories.pop() if self._memories else Memory()
+        try:
+            memory = self._memories.pop()
+        except IndexError:  # the first evaluation, or others are under way
+            memory = Memory()
+        try:
+            return self._differentiate(phi, a, theta, simulation, memory)
+        finally:
+            self._memories.append(memory)
+
+    def _differentiate(
+        self, phi: NDArray, a: NDArray, theta: NDArray, simulation: Simulation, memory: Memory
+    ) -> Evaluation:
         with simulation.checkpoints(self.checkpointing) as checkpoints:
             forward = simulation.forward(checkpoints, memory)
             self._check(forward.margins, simulation)
             objective = self.objective(simulation)
             value = float(_finite(objective.value(forward.state), simulation))
             gradient = forward.reverse(objective.seed(forward.state))
-        self._memories.append(memory)
         bars = np.zeros((3, len(self.particles.position)))
         bars[:, self.present(phi)] = gradient.density, gradient.lame_lambda, gradient.lame_mu
         phi_bar = self.chain.pullback(phi, *bars)
@@ -304,11 +316,13 @@ class Problem:
                 raise _too_long(simulation, f"{what} reached {value:.3g}, the limit is {limit:.3g}")
         limit = LIMITS.stretch * self.scene.particles_per_cell
         if not margins.stretch <= limit:
-            raise _failed(
-                simulation,
+            raise TornError(
                 f"solid is stretched {margins.stretch:.3g} times, beyond {limit:.3g} it is torn",
-                "take more particles per cell (now "
-                f"{self.scene.particles_per_cell}), a stiffer body or weaker actuation",
+                simulation.steps,
+                -1,
+                (np.nan, np.nan),
+                f"take more particles per cell (now {self.scene.particles_per_cell}), a stiffer "
+                "body or weaker actuation",
             )
 
 
@@ -331,9 +345,4 @@ def _finite(values: Any, simulation: Simulation) -> Any:
 def _too_long(simulation: Simulation, what: str) -> SimulationError:
     """What the step is too long for, as an error about the whole body."""
     hint = f"take a smaller time step (now {simulation.scene.time_step:g})"
-    return _failed(simulation, what, hint)
-
-
-def _failed(simulation: Simulation, what: str, hint: str) -> SimulationError:
-    """A failure of the whole body."""
     return SimulationError(what, simulation.steps, -1, (np.nan, np.nan), hint)

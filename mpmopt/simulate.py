@@ -58,6 +58,7 @@ def world_of(scene: Scene) -> mpm.World:
         mirror_axis=-1 if scene.mirror is None else scene.mirror.normal,
         mirror_node=0 if scene.mirror is None else round(scene.mirror.position / dx),
         keep=math.exp(-scene.time_step / scene.blend_time) if scene.blend_time else 0.0,
+        dust=0.0,
     )
 
 
@@ -178,7 +179,9 @@ class Simulation:
         real = np.empty(0, dtype).real.dtype
         self.scene = scene
         self.particles = particles
-        self.world = world_of(scene)
+        # A node's mass is a sum that cancels, so the least of it is rounding of a particle's.
+        dust = 8.0 * np.finfo(real).eps * float((particles.volume * np.real(density)).max())
+        self.world = world_of(scene)._replace(dust=dust)
         actuator = mpm.grouped(particles.actuator)
         stress = [(S[0][0], S[0][1], S[1][1]) for S in (a.stress for a in scene.actuators)]
         self.body = mpm.Body(

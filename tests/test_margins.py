@@ -9,7 +9,7 @@ from walker import slanted_legs, walker
 
 from mpmopt import mpm
 from mpmopt.checkpoints import Checkpointing
-from mpmopt.errors import DesignError, SimulationError
+from mpmopt.errors import DesignError, SimulationError, TornError
 from mpmopt.optimize import Settings, Stage, optimise
 from mpmopt.problem import LIMITS, Problem
 from mpmopt.scene import Actuator, Design, Material, Solid, Wall
@@ -95,9 +95,9 @@ def test_solid_that_is_torn_is_an_error_and_no_distance():
     problem = Problem(dataclasses.replace(scene, body=body), 8.0, leave_out=0.05, redo=1)
     positions = problem.particles.position[problem.particles.designed]
     x = problem.join(np.where(slanted_legs(positions), 1.0, -1.0), 1.0, -0.3, -1.0)
-    with pytest.raises(SimulationError, match=r"solid is stretched .* more particles per cell"):
+    with pytest.raises(TornError, match=r"solid is stretched .* more particles per cell"):
         problem.value(x)
-    with pytest.raises(SimulationError, match=r"solid is stretched .* more particles per cell"):
+    with pytest.raises(TornError, match=r"solid is stretched .* more particles per cell"):
         problem.value_and_gradient(x)
     gentle = Problem(scene, 8.0, leave_out=0.05, redo=1).evaluate(x)
     assert 1.0 < gentle.margins.stretch <= LIMITS.stretch * scene.particles_per_cell

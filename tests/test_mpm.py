@@ -72,6 +72,20 @@ def state(free, rng):
     return state
 
 
+@pytest.mark.parametrize("off", [1e-8, 1e-10, -1e-10, 1e-12])
+def test_nodes_that_are_hardly_touched_spoil_nothing(state, off):
+    # Particles this close to where their cell ends put 1e-16 of their mass or less on outer nodes.
+    scene = small_scene(walls=())
+    state[0] += (0.25 + off) * scene.grid.dx
+    ones = np.ones(state.shape[1])
+    signal = np.full((scene.steps, 2), 0.5)
+    particles = lay_out(scene)
+    simulation = Simulation(scene, particles, ones, 10.0 * ones, 10.0 * ones, signal, state)
+    expected = step(simulation, state, 0)
+    found = simulation.run([1])[0]
+    assert np.abs(found - expected).max() <= 1e-12 * np.abs(expected).max()
+
+
 @pytest.mark.parametrize("x", [0.5, 0.51, 0.75, 1.0, 1.3, 1.4999])
 def test_weights_interpolate_linear_fields_and_know_the_second_moment(x):
     dx = 0.1

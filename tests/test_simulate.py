@@ -9,6 +9,7 @@ from walker import walker
 from mpmopt.errors import DesignError, SimulationError
 from mpmopt.particles import lay_out
 from mpmopt.problem import Problem
+from mpmopt.scene import Grid, Scene, Solid
 from mpmopt.simulate import Simulation
 
 
@@ -28,6 +29,17 @@ def test_frames_are_the_states_on_the_way(scene):
     assert np.array_equal(frames[3], run.run())
     shorter = simulation(dataclasses.replace(scene, steps=3))
     assert np.array_equal(shorter.run(), frames[1])
+
+
+def test_frames_of_one_group_of_particles_are_their_own():
+    # Four particles fill their group, so that no copy is made on the way by chance.
+    c = 1 / 16
+    body = (Solid((4 * c, 4 * c), (5 * c, 5 * c)),)
+    falling = simulation(Scene(Grid((16, 16), c), 4e-3, 20, body, gravity=(1.0, 0.0)))
+    assert falling.initial.shape[1] == 4
+    frames = falling.run([0, 10, 20])
+    assert np.array_equal(frames[0], falling.initial)
+    assert np.all(np.diff(frames[:, 0], axis=0) > 0.0)
 
 
 @pytest.mark.parametrize("frames", [[-1], [41], [3, 2]])
