@@ -100,10 +100,20 @@ def cheapest(path: Path, tolerance: float, gradient_tolerance: float | None, sec
     return 0
 
 
+def resume(path: Path) -> int:
+    """Go on with a run that was stopped; the exit code says how that ended."""
+    from mpmopt import case
+
+    return case.reported(lambda: case.resume(path), path)
+
+
 def main(argv: list[str] | None = None) -> int:
     """Run a command; 0 if all is well, 1 if not, 2 if it was not understood."""
     parser = argparse.ArgumentParser(prog="python -m mpmopt", description=__doc__)
     commands = parser.add_subparsers(required=True)
+    command = commands.add_parser("resume", help="go on with a run that was stopped")
+    command.add_argument("path", type=Path, metavar="RUN.h5")
+    command.set_defaults(do=lambda arguments: resume(arguments.path))
     command = commands.add_parser("verify", help="check the gradients of a run's best design")
     command.add_argument("path", type=Path, metavar="RUN.h5")
     command.set_defaults(do=lambda arguments: verify(arguments.path))

@@ -13,6 +13,7 @@ from tempfile import TemporaryFile
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from tqdm import tqdm
 
 from mpmopt import runfile
@@ -20,10 +21,17 @@ from mpmopt.audit import audit
 from mpmopt.binary import THRESHOLD, Drawing, farthest, full_block, pieces, post_processed
 from mpmopt.checkpoints import Checkpointing
 from mpmopt.errors import MpmoptError, SimulationError, StorageError
-from mpmopt.optimize import Optimisation, Settings, Stage, optimise
+from mpmopt.files import locked, replace_file
+from mpmopt.history import Optimisation
+from mpmopt.interrupt import Interrupted, interruptible
+from mpmopt.optimize import Settings, Stage, begin, go_on
+from mpmopt.particles import lay_out
 from mpmopt.problem import Problem, Variables
 from mpmopt.scene import Scene
 
+logger = logging.getLogger(__name__)
+
+RESULTS = ("summary.json", "design.png", "history.png")  # besides run.h5
 START = {"phi": 0.0, "a": 1.0, "theta": -0.3, "b": -0.5}
 QUARTER_TURNS = (0.0, 0.5, 1.0, -0.5)  # of theta, for the starts that scout
 
@@ -105,6 +113,7 @@ class ProgressBar:
 
     def __call__(self, run: Optimisation) -> None:
         last = run.history[-1]
+        self._bar.n = len(run.history) - 1
         if run.stop_reason:
             self._bar.close()
             return
@@ -115,11 +124,23 @@ class ProgressBar:
             print(f"{len(run.history)} gradients, {last.seconds:.0f} s: {text}", file=sys.stderr)
 
 
-def run(case: Case, out: Path, checkpointing: Checkpointing | None = None) -> dict[str, Any]:
+def run(
+    case: Case, out: Path, checkpointing: Checkpointing | None = None, force: bool = False
+) -> dict[str, Any]:
     """Optimise a case and leave its results in a folder.
 
-    Writes ``run.h5`` (after every evaluation), ``summary.json``, ``design.png`` and
-    ``history.png``.
+    Writes ``run.h5`` (before the first and after every evaluation), ``summary.json``,
+    ``design.png`` and ``history.png``. A folder that holds an unfinished run of this case is gone
+    on with; one that holds a finished one is left as it is.
+
+    Parameters
+    ----------
+    case : Case
+    out : Path
+        Folder, made if it is not there.
+    checkpointing : Checkpointing, optional
+    force : bool, optional
+        Begin anew and replace whatever the folder holds under those names.
 
     Returns
     -------
@@ -129,46 +150,107 @@ def run(case: Case, out: Path, checkpointing: Checkpointing | None = None) -> di
     Raises
     ------
     StorageError
-        If the folder cannot be made or already holds a run.
+        If the folder cannot be made, holds another case's run or foreign files of those names, or
+        another process is at work in it.
     MpmoptError
         As `optimise` does.
     """
     path = out / "run.h5"
-    if path.exists():
-        raise StorageError(f"{path} holds an earlier run; choose another folder or move it away")
     try:
         out.mkdir(parents=True, exist_ok=True)
         with TemporaryFile(dir=out):
             pass
     except OSError as error:
         raise StorageError(f"cannot write to {out}: {error}; choose another folder") from error
-    first = case.settings.stages[0]
-    problem = Problem(first.scene(case.scene), first.beta)
-    turns = QUARTER_TURNS if case.settings.scouting else (0.0,)
-    starts = [problem.join(**{**START, "theta": START["theta"] + turn}) for turn in turns]
-    result = optimise(
-        case.scene,
-        case.settings,
-        starts,
-        [lambda current: runfile.write(path, current), ProgressBar()],
-        checkpointing,
-    )
-    summary = summarise(result, case.drawing)
-    runfile.write(path, result, summary)
+    with locked(path):
+        if path.exists() and not force:
+            kept = runfile.read(path)
+            if (kept.scene, kept.settings) != (case.scene, case.settings):
+                raise StorageError(
+                    f"{path} holds an earlier run of another case; choose another folder, or "
+                    "--force to replace it"
+                )
+            return _go_on(path, kept, checkpointing)
+        foreign = [name for name in RESULTS if (out / name).exists()]
+        if foreign and not force:
+            raise StorageError(
+                f"{out} holds {', '.join(foreign)} but no run.h5; choose another folder, or "
+                "--force to replace them"
+            )
+        first = case.settings.stages[0]
+        problem = Problem(first.scene(case.scene), first.beta)
+        turns = QUARTER_TURNS if case.settings.scouting else (0.0,)
+        starts = [problem.join(**{**START, "theta": START["theta"] + turn}) for turn in turns]
+        begun = begin(case.scene, case.settings, starts)
+        runfile.write(path, begun, drawing=drawn(case))
+        return _go_on(path, runfile.read(path), checkpointing)
+
+
+def resume(path: Path, checkpointing: Checkpointing | None = None) -> dict[str, Any]:
+    """Go on with the run of a run file to the end that it would have had without a stop.
+
+    Returns
+    -------
+    dict
+        The summary, also of a run that was finished already.
+
+    Raises
+    ------
+    RunFileError
+        If there is no run file, or it is damaged.
+    StorageError
+        If another process is at work on it.
+    MpmoptError
+        As `optimise` does.
+    """
+    with locked(path):
+        return _go_on(path, runfile.read(path), checkpointing)
+
+
+def drawn(case: Case) -> dict[int, NDArray[np.bool_]]:
+    """Which design particles the case's drawing has, for each coarsening of its stages."""
+    there = {}
+    for stage in case.settings.stages:
+        particles = lay_out(stage.scene(case.scene))
+        there[stage.coarsening] = case.drawing(particles.position[particles.designed])
+    return there
+
+
+def _go_on(
+    path: Path, kept: runfile.RunFile, checkpointing: Checkpointing | None
+) -> dict[str, Any]:
+    if kept.summary:
+        print(f"{path} holds a finished run.", file=sys.stderr)
+        return kept.summary
+    if kept.versions != runfile.versions():
+        logger.warning("%s was begun with %s: digits may differ", path, kept.versions)
+    if kept.run.history:
+        print(f"Going on after {len(kept.run.history)} evaluations.", file=sys.stderr)
+
+    def save(current: Optimisation) -> None:
+        runfile.write(path, current, drawing=kept.drawing)
+
+    result = go_on(kept.run, [save, ProgressBar()], checkpointing)
+    summary = summarise(result, kept.drawing)
     text = json.dumps(summary, indent=1) + "\n"
-    runfile.replace_file(out / "summary.json", text.encode())
-    _draw(out, result, summary)
+    replace_file(path.parent / "summary.json", text.encode())
+    _draw(path.parent, result, summary)
+    runfile.write(path, result, summary, kept.drawing)
     return summary
 
 
-def summarise(result: Optimisation, drawing: Drawing) -> dict[str, Any]:
+def summarise(result: Optimisation, drawing: Mapping[int, NDArray[np.bool_]]) -> dict[str, Any]:
     """Objective values (L, larger is farther), actuation and counts of a finished optimisation.
+
+    The drawing is that of `drawn`, or empty.
 
     Reference designs count with the better of the first and the best design's actuation.
     """
     best, problem = result.result, result.problem()
     _, *others = audits = audit(problem, best.x)
-    first = result.history[0]
+    first = result.first
+    assert first is not None
+    there = drawing.get(result.settings.stages[best.stage].coarsening)
     actuations = [Variables.of(item.x, item.gamma.size) for item in (first, best)]
     actuation = actuations[1]
 
@@ -178,7 +260,9 @@ def summarise(result: Optimisation, drawing: Drawing) -> dict[str, Any]:
     return {
         "start": _value_or_none(lambda: first.objective),
         "reference": _value_or_none(lambda: farthest(problem.scene, full_block, *actuations)),
-        "reference_drawn": _value_or_none(lambda: farthest(problem.scene, drawing, *actuations)),
+        "reference_drawn": None
+        if there is None
+        else _value_or_none(lambda: farthest(problem.scene, lambda _: there, *actuations)),
         "optimised": best.objective,
         "post_processed": _value_or_none(lambda: post_processed(problem, best.x)),
         "loose_particles": int(
@@ -203,7 +287,7 @@ def _value_or_none(function: Callable[[], float]) -> float | None:
     try:
         return _number_or_none(function())
     except SimulationError as error:
-        logging.getLogger(__name__).warning("no value: %s", error)
+        logger.warning("no value: %s", error)
         return None
 
 
@@ -249,10 +333,17 @@ def main(description: str, cases: Mapping[str, Case], argv: list[str] | None = N
     Returns
     -------
     int
-        Exit code: 0, 1 with a message on standard error, or 130 if interrupted.
+        Exit code: 0, 1 with a message on standard error, or 128 and the number of a signal.
     """
     parser = argparse.ArgumentParser(description=description)
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of results")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        required=True,
+        metavar="DIR",
+        help="folder of results; an unfinished run in it is gone on with",
+    )
+    parser.add_argument("--force", action="store_true", help="begin anew, replace earlier results")
     choice = parser.add_mutually_exclusive_group()
     for name, case in cases.items():
         if name != "default":
@@ -264,13 +355,21 @@ def main(description: str, cases: Mapping[str, Case], argv: list[str] | None = N
     arguments = parser.parse_args(argv)
     logging.basicConfig(format="%(message)s")
     setting = getattr(arguments, "setting", None) or "default"
+    return reported(
+        lambda: run(cases[setting], arguments.out, force=arguments.force), arguments.out / "run.h5"
+    )
+
+
+def reported(work: Callable[[], Mapping[str, Any]], path: Path) -> int:
+    """Print the summary that some work on a run file ends with, or why it ended; the exit code."""
+    advice = f"Every evaluation is saved; go on with: python -m mpmopt resume {path}"
     try:
-        summary = run(cases[setting], arguments.out)
+        with interruptible(advice):
+            print(table(work()))
     except MpmoptError as error:
         print(f"{type(error).__name__}: {error}", file=sys.stderr)
         return 1
-    except KeyboardInterrupt:
-        print(f"Interrupted; {arguments.out / 'run.h5'} holds the run so far.", file=sys.stderr)
-        return 130
-    print(table(summary))
+    except Interrupted as interrupted:
+        print(f"\n{interrupted}. {advice}", file=sys.stderr)
+        return interrupted.code
     return 0

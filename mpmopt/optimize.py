@@ -6,7 +6,7 @@ import dataclasses
 import logging
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,7 @@ from mpmopt.checkpoints import Checkpointing
 from mpmopt.checks import count, number, share
 from mpmopt.design import greyness
 from mpmopt.errors import DesignError, SimulationError
+from mpmopt.history import Candidate, Iteration, Leg, Optimisation, StageState
 from mpmopt.mma import MovingAsymptotes
 from mpmopt.problem import Problem
 from mpmopt.scene import Scene
@@ -175,125 +176,6 @@ class Settings:
             raise DesignError(f"Settings: tolerance = {self.tolerance} must not be negative")
 
 
-@dataclass(frozen=True)
-class Iteration:
-    """One evaluation.
-
-    Attributes
-    ----------
-    start : int
-        Index of the start that it goes back to.
-    stage : int
-        Index of the stage.
-    beta, move_limit : float
-        In force during the evaluation.
-    time_step : float
-        That the values are of; of the last attempt if it failed.
-    x : (n,) array
-        The design that was evaluated.
-    gamma : (D,) array
-        Its material density.
-    objective : float
-        L, or not a number if the evaluation failed.
-    greyness : float
-        Mean of 4 gamma (1 - gamma).
-    projected_gradient : float
-        Greatest change of L per unit of x that the bounds leave free.
-    step : float
-        Greatest change of a variable since the last evaluation, as a fraction of its range.
-    seconds : float
-        Since the optimisation began.
-    post_processed : float
-        L without void, or not a number if the stage does not ask for it or it failed.
-    redone : int
-        How often the stage's time step was halved for this evaluation.
-    courant, spin, jacobian, stretch : float
-        Its `simulate.Margins`, or not a number if it failed.
-    failure : str
-        Why the evaluation failed, or empty.
-    """
-
-    start: int
-    stage: int
-    beta: float
-    time_step: float
-    move_limit: float
-    x: NDArray[np.float64]
-    gamma: NDArray[np.float64]
-    objective: float
-    greyness: float
-    projected_gradient: float
-    step: float
-    seconds: float
-    post_processed: float = np.nan
-    redone: int = 0
-    courant: float = np.nan
-    spin: float = np.nan
-    jacobian: float = np.nan
-    stretch: float = np.nan
-    failure: str = ""
-
-
-@dataclass
-class Optimisation:
-    """An optimisation as it stands: what `optimise` hands to callbacks and returns.
-
-    Attributes
-    ----------
-    scene : Scene
-    settings : Settings
-    history : list of Iteration
-        All evaluations.
-    best : dict of int to Iteration
-        The best evaluation of each stage that had one.
-    stop_reason : str
-        A sentence; empty while it runs.
-    """
-
-    scene: Scene
-    settings: Settings
-    history: list[Iteration] = field(default_factory=list)
-    best: dict[int, Iteration] = field(default_factory=dict)
-    stop_reason: str = ""
-
-    @property
-    def result(self) -> Iteration:
-        """The best evaluation on the last stage's grid.
-
-        That is the one that goes farthest without void, where stages ask for that; else the best of
-        the last stage that had one, whose projection is the sharpest.
-
-        Raises
-        ------
-        DesignError
-            If no evaluation succeeded.
-        """
-        if not self.best:
-            last = self.history[-1].failure if self.history else "none was made"
-            raise DesignError(f"no evaluation succeeded; the last: {last}")
-        stages = self.settings.stages
-        grid = stages[max(self.best)].coarsening
-        return max(
-            (item for stage, item in self.best.items() if stages[stage].coarsening == grid),
-            key=lambda item: (np.nan_to_num(item.post_processed, nan=-np.inf), item.stage),
-        )
-
-    def problem(self) -> Problem:
-        """The problem that `result` solves, in the time step that it was evaluated with."""
-        best = self.result
-        return self.settings.stages[best.stage].problem(self.scene, best.time_step)
-
-    @property
-    def failed_evaluations(self) -> int:
-        """Number of evaluations that failed."""
-        return sum(bool(iteration.failure) for iteration in self.history)
-
-    @property
-    def redone_evaluations(self) -> int:
-        """Number of evaluations that were redone with a shorter time step."""
-        return sum(iteration.redone > 0 for iteration in self.history)
-
-
 Callback = Callable[[Optimisation], None]
 
 
@@ -329,6 +211,21 @@ def optimise(
     StorageError
         If checkpoints cannot be stored.
     """
+    return go_on(begin(scene, settings, start), callbacks, checkpointing)
+
+
+def begin(
+    scene: Scene,
+    settings: Settings,
+    start: NDArray[np.float64] | Sequence[NDArray[np.float64]],
+) -> Optimisation:
+    """An optimisation before its first evaluation, for `go_on`; see `optimise`.
+
+    Raises
+    ------
+    DesignError, SceneError
+        As `optimise`.
+    """
     starts = [start] if isinstance(start, np.ndarray) else list(start)
     scenes = [stage.scene(scene) for stage in settings.stages]
     first = Problem(scenes[0])
@@ -337,36 +234,40 @@ def optimise(
         raise DesignError("there is nothing to design: give a Design or an Actuator, and a start")
     if len(designs) > 1 and settings.scouting == 0:
         raise DesignError(f"{len(designs)} starts need Settings.scouting >= 1, the stages of each")
-    climb = _Climb(Optimisation(scene, settings), scenes, tuple(callbacks), checkpointing)
-    scouting = settings.scouting if len(designs) > 1 else 0
-    scouted = [climb.stages(0, scouting, number, x) for number, x in enumerate(designs)]
-    chosen = max(scouted, key=lambda leg: leg.merit)
-    climb.run.best = chosen.best
-    last = chosen if chosen.gave_up else climb.stages(scouting, len(scenes), chosen.start, chosen.x)
-    reached = last.stage + 1
-    climb.run.stop_reason = f"Stage {reached} of {len(scenes)} was the last: {last.reason}"
+    return Optimisation(scene, settings, [Leg(k, x) for k, x in enumerate(designs)])
+
+
+def go_on(
+    run: Optimisation,
+    callbacks: Iterable[Callback] = (),
+    checkpointing: Checkpointing | None = None,
+) -> Optimisation:
+    """Go on with an optimisation from where it stands to its end; see `optimise`.
+
+    What a callback saw after an evaluation is all that this needs: from there it takes, bit for
+    bit, the way of an optimisation that was never stopped.
+
+    Raises
+    ------
+    SceneError, StorageError
+        As `optimise`.
+    """
+    climb = _Climb(run, tuple(callbacks), checkpointing)
+    stages = len(run.settings.stages)
+    if run.stop_reason:
+        return run
+    scouting = run.settings.scouting if len(run.legs) > 1 else 0
+    for leg in run.legs:
+        if leg.stage < scouting and not leg.gave_up:
+            run.leg = leg.start
+            climb.stages(leg, scouting)
+    run.leg = max(run.legs, key=lambda leg: leg.merit).start
+    leg = run.legs[run.leg]
+    climb.stages(leg, stages)
+    reached = leg.stage + leg.gave_up
+    run.stop_reason = f"Stage {reached} of {stages} was the last: {leg.reason}"
     climb.report()
-    return climb.run
-
-
-@dataclass
-class _Leg:
-    """How far one start has come."""
-
-    start: int
-    x: NDArray[np.float64]
-    stage: int = 0
-    reason: str = ""
-    gave_up: bool = False
-    best: dict[int, Iteration] = field(default_factory=dict)
-
-    @property
-    def merit(self) -> tuple[int, float]:
-        """What the starts are compared by: the last stage that had a design, and its best."""
-        if not self.best:
-            return -1, -np.inf
-        item = self.best[max(self.best)]
-        return item.stage, item.objective if np.isnan(item.post_processed) else item.post_processed
+    return run
 
 
 class _Climb:
@@ -375,95 +276,110 @@ class _Climb:
     def __init__(
         self,
         run: Optimisation,
-        scenes: list[Scene],
         callbacks: tuple[Callback, ...],
         checkpointing: Checkpointing | None,
     ) -> None:
-        self.run, self.scenes = run, scenes
-        self.callbacks, self.checkpointing = callbacks, checkpointing
-        self.began = time.monotonic()
+        self.run, self.callbacks, self.checkpointing = run, callbacks, checkpointing
+        self.scenes = [stage.scene(run.scene) for stage in run.settings.stages]
+        self.began = time.monotonic() - (run.history[-1].seconds if run.history else 0.0)
 
     def report(self) -> None:
         for callback in self.callbacks:
             callback(self.run)
 
-    def stages(self, first: int, last: int, start: int, x: NDArray[np.float64]) -> _Leg:
-        """Climb from x through the stages from `first` to before `last`."""
-        leg = _Leg(start, x)
-        if first == 0:
-            self.run.best = {}
-        for index in range(first, last):
-            stage = _StageRun(self, index, start)
-            if (
-                index > 0
-                and stage.stage.coarsening != self.run.settings.stages[index - 1].coarsening
-            ):
-                leg.x = stage.problem.transfer(Problem(self.scenes[index - 1]), leg.x)
-            leg.stage = index
-            leg.x, leg.reason, leg.gave_up = stage.climb(leg.x)
-            logger.info("start %d, stage %d: %s", start, index, leg.reason)
-            if leg.gave_up:
-                break
-        leg.best = dict(self.run.best)
-        return leg
+    def stages(self, leg: Leg, last: int) -> None:
+        """Climb from where a leg stands through the stages before `last`."""
+        stages = self.run.settings.stages
+        while leg.stage < last and not leg.gave_up:
+            stage = _StageRun(self, leg)
+            before = leg.stage - 1
+            begins = self.run.stage_state is None and before >= 0
+            if begins and stage.stage.coarsening != stages[before].coarsening:
+                leg.x = stage.problem.transfer(Problem(self.scenes[before]), leg.x)
+            leg.x, leg.reason, leg.gave_up = stage.climb()
+            self.run.stage_state = None
+            logger.info("start %d, stage %d: %s", leg.start, leg.stage, leg.reason)
+            leg.stage += not leg.gave_up
 
 
 class _StageRun:
-    """One stage on its way."""
+    """One stage on its way: from its first design, or from its state after an evaluation."""
 
-    def __init__(self, whole: _Climb, index: int, start: int) -> None:
-        self.whole, self.run, self.index, self.start = whole, whole.run, index, start
-        self.stage = self.run.settings.stages[index]
-        self.problem = self.stage.problem(self.run.scene, None, whole.checkpointing)
-        self.best_merit: tuple[float, ...] | None = None
-        self.farthest: tuple[Iteration, NDArray[np.float64]] | None = None  # and its gradient
-
-    def climb(self, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], str, bool]:
-        """Climb from x to where the stop rule ends the stage.
-
-        Returns the design that the next stage starts from, why it stopped, and whether to give up.
-        """
+    def __init__(self, whole: _Climb, leg: Leg) -> None:
+        self.whole, self.run, self.leg = whole, whole.run, leg
         settings = self.run.settings
-        mma = MovingAsymptotes(
-            -np.ones(x.size),
-            np.ones(x.size),
+        self.stage = settings.stages[leg.stage]
+        state = self.run.stage_state
+        self._pose(state.time_step if state else None)
+        self.mma = MovingAsymptotes(
+            -np.ones(self.problem.size),
+            np.ones(self.problem.size),
             move_limit=self.stage.move_limit,
             asymptote_initial=0.5 / (self.stage.beta + 1.0) if settings.sharpen_asymptotes else 0.5,
         )
-        values: list[float] = []
-        failures = 0
-        while True:
-            evaluated = self._evaluate(x, mma.move_limit)
-            if evaluated is None:
-                failures += 1
-                none_ran = self.farthest is None
-                if failures >= settings.most_failures or (none_ran and failures > HALVINGS):
-                    why = f"it gave up after {failures} failed evaluations in a row."
-                    return x, why, True
-                if self.farthest is None:
-                    self._halve_time_step()
-                    continue
-                mma.reset()
-                mma.move_limit /= 2.0
-                item, gradient = self.farthest
-                x = mma.step(item.x, -item.objective, -gradient)
-                continue
-            failures = 0
-            value, gradient = evaluated
-            values.append(value)
-            stop = self._stop_reason(values)
-            if stop:
-                onward = self.farthest[0].x if self.farthest and settings.best_first else x
-                return onward, stop, False
-            went_back = len(values) > 1 and value < values[-2]
-            factor = SHORTEN if went_back and settings.adapt_move_limit else LENGTHEN
-            mma.move_limit = min(self.stage.move_limit, factor * mma.move_limit)
-            x = mma.step(x, -value, -gradient)
+        self.values: list[float] = []
+        self.failures = 0
+        self.farthest: Candidate | None = None
+        self.gradient = self.farthest_gradient = np.empty(0)
+        if state:
+            self.mma.restore(state.mma)
+            self.values, self.failures = state.values.tolist(), state.failures
+            self.gradient = state.gradient
+            self.farthest, self.farthest_gradient = state.farthest, state.farthest_gradient
 
-    def _evaluate(
-        self, x: NDArray[np.float64], move_limit: float
-    ) -> tuple[float, NDArray[np.float64]] | None:
-        """Value and gradient, recorded; None if the simulation failed."""
+    def _pose(self, time_step: float | None) -> None:
+        self.problem = self.stage.problem(self.run.scene, time_step, self.whole.checkpointing)
+
+    def state(self) -> StageState:
+        """All that the next step depends on."""
+        return StageState(
+            time_step=self.problem.scene.time_step,
+            failures=self.failures,
+            values=np.array(self.values),
+            gradient=self.gradient,
+            farthest=self.farthest,
+            farthest_gradient=self.farthest_gradient,
+            mma=self.mma.state(),
+        )
+
+    def climb(self) -> tuple[NDArray[np.float64], str, bool]:
+        """Climb to where the stop rule ends the stage.
+
+        Returns the design that the next stage starts from, why it stopped, and whether to give up.
+        """
+        if self.run.stage_state is None:
+            self._evaluate(self.leg.x)
+        while True:
+            assert self.run.last is not None
+            x, reason = self.run.last.x, self._stop_reason()
+            if not reason:
+                self._evaluate(self._step(x))
+            elif self.failures:
+                return x, reason, True
+            elif self.farthest is not None and self.run.settings.best_first:
+                return self.farthest.x, reason, False
+            else:
+                return x, reason, False
+
+    def _step(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The design to evaluate after x."""
+        mma = self.mma
+        if self.failures and self.farthest is None:
+            scene = self.problem.scene
+            logger.warning("no design of this stage ran yet: time step %g halved", scene.time_step)
+            self._pose(scene.time_step / 2.0)
+            return x
+        if self.failures and self.farthest is not None:
+            mma.reset()
+            mma.move_limit /= 2.0
+            return mma.step(self.farthest.x, -self.farthest.objective, -self.farthest_gradient)
+        went_back = len(self.values) > 1 and self.values[-1] < self.values[-2]
+        factor = SHORTEN if went_back and self.run.settings.adapt_move_limit else LENGTHEN
+        mma.move_limit = min(self.stage.move_limit, factor * mma.move_limit)
+        return mma.step(x, -self.values[-1], -self.gradient)
+
+    def _evaluate(self, x: NDArray[np.float64]) -> None:
+        """Value and gradient, recorded, even of a simulation that failed."""
         run = self.run
         value, failure = np.nan, ""
         gradient: NDArray[np.float64] = np.full(x.size, np.nan)
@@ -480,17 +396,17 @@ class _StageRun:
         solid = np.nan
         if self.stage.solid and not failure:
             solid = self._without_void(problem.at(time_step), x)
-        before = run.history[-1].x if run.history else x
+        before = run.last.x if run.last else x
         if before.size != x.size:  # another grid
             before = x
         free = np.where(gradient > 0.0, x < 1.0, x > -1.0)
         gamma = self.problem.gamma(x)
-        iteration = Iteration(
-            start=self.start,
-            stage=self.index,
+        candidate = Candidate(
+            start=self.leg.start,
+            stage=self.leg.stage,
             beta=self.stage.beta,
             time_step=time_step,
-            move_limit=move_limit,
+            move_limit=self.mma.move_limit,
             x=x.copy(),
             gamma=gamma,
             objective=value,
@@ -506,15 +422,32 @@ class _StageRun:
             stretch=margins.stretch,
             failure=failure,
         )
-        run.history.append(iteration)
-        merit = (np.nan_to_num(solid, nan=-np.inf), value) if self.stage.solid else (value,)
-        if not failure and (self.farthest is None or value > self.farthest[0].objective):
-            self.farthest = iteration, gradient
-        if not failure and (self.best_merit is None or merit > self.best_merit):
-            run.best[self.index] = iteration
-            self.best_merit = merit
+        self._record(candidate, gradient)
         self.whole.report()
-        return None if failure else (value, gradient)
+
+    def _record(self, candidate: Candidate, gradient: NDArray[np.float64]) -> None:
+        run = self.run
+        run.first = run.first or candidate
+        run.last = candidate
+        run.history.append(Iteration(**candidate.numbers()))
+        if candidate.failure:
+            self.failures += 1
+            self.gradient = np.empty(0)
+        else:
+            self.failures = 0
+            self.values.append(candidate.objective)
+            self.gradient = gradient
+            if self.farthest is None or candidate.objective > self.farthest.objective:
+                self.farthest, self.farthest_gradient = candidate, gradient
+            best = run.best.get(candidate.stage)
+            if best is None or self._merit(candidate) > self._merit(best):
+                run.best[candidate.stage] = candidate
+        run.stage_state = self.state()
+
+    def _merit(self, item: Iteration) -> tuple[float, ...]:
+        if self.stage.solid:
+            return float(np.nan_to_num(item.post_processed, nan=-np.inf)), item.objective
+        return (item.objective,)
 
     def _without_void(self, problem: Problem, x: NDArray[np.float64]) -> float:
         try:
@@ -523,17 +456,15 @@ class _StageRun:
             logger.warning("the design fails without void: %s", error)
             return np.nan
 
-    def _halve_time_step(self) -> None:
-        scene = self.problem.scene
-        logger.warning("no design of this stage ran yet: time step %g halved", scene.time_step)
-        self.problem = self.stage.problem(
-            self.run.scene, scene.time_step / 2.0, self.whole.checkpointing
-        )
-
-    def _stop_reason(self, values: list[float]) -> str:
-        """Why the stage ends after these objective values, or nothing."""
+    def _stop_reason(self) -> str:
+        """Why the stage ends after its last evaluation, or nothing."""
         settings = self.run.settings
-        count, window = len(values), settings.window
+        if self.failures:
+            none_ran = self.farthest is None
+            if self.failures >= settings.most_failures or (none_ran and self.failures > HALVINGS):
+                return f"it gave up after {self.failures} failed evaluations in a row."
+            return ""
+        values, count, window = self.values, len(self.values), settings.window
         if count >= max(settings.least_iterations, window + 1):
             change = abs(np.mean(values[-window:]) - np.mean(values[-window - 1 : -1]))
             if change <= settings.tolerance:

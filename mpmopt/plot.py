@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
-from mpmopt.optimize import Optimisation
+from mpmopt.history import Optimisation
 from mpmopt.problem import Problem
 from mpmopt.scene import Mirror, Scene
 from mpmopt.simulate import Simulation

@@ -1,22 +1,28 @@
 """The one file that a run leaves: scene, settings, versions, history and designs, in HDF5.
 
-Layout (version 2)::
+Layout (version 3)::
 
-    attributes       format, version, stop_reason; as JSON: scene, settings, versions, summary
+    attributes       format, version, digest, leg (the start that goes on), stop_reason; as JSON:
+                     scene, settings, versions, summary
     history/NAME     one entry per evaluation: objective, beta, greyness, step, ...
-    stages/K/        best design of stage K: x, gamma; attributes of its evaluation
-    best/            the best of all, with phi, a, theta, b spelled out; attribute stage
+    best/            the best of all, with gamma, phi, a, theta, b; attribute stage
+    legs/L/          start L: the design x that its stage began with; attributes stage, reason, ...
+    legs/L/stages/K/ its best design of stage K: x, gamma; attributes of its evaluation
+    first/, last/    the first and the last evaluation, in the same way
+    stage/           a stage that is under way: what its next step depends on
+    drawing/C        which particles of a drawn design are there, with C cells of the scene in one
+
+The digest (SHA-256) is of all names, attributes and numbers.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
-import os
 import platform
-import tempfile
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
@@ -26,12 +32,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 import mpmopt
-from mpmopt.errors import MpmoptError, RunFileError, StorageError
-from mpmopt.optimize import Iteration, Optimisation, Settings, Stage
+from mpmopt.errors import MpmoptError, RunFileError
+from mpmopt.files import replace_file
+from mpmopt.history import Candidate, Iteration, Leg, Optimisation, StageState
+from mpmopt.optimize import Settings, Stage
 from mpmopt.problem import Problem, Variables
 from mpmopt.scene import Scene
 
-FORMAT, VERSION = "mpmopt run", 2
+FORMAT, VERSION = "mpmopt run", 3
+WHOLE = tuple(f.name for f in dataclasses.fields(Iteration) if f.type == "int")
 COLUMNS = tuple(f.name for f in dataclasses.fields(Iteration) if f.type in ("int", "float"))
 
 
@@ -41,33 +50,47 @@ class RunFile:
 
     Attributes
     ----------
-    scene : Scene
-    settings : Settings
+    run : Optimisation
+        As it stood: `optimize.go_on` goes on with it.
     versions : dict of str to str
         Of this package and of those it computes with.
-    history : dict of str to (n,) array
-        Columns named as the fields of `Iteration`.
-    designs : dict of int to (n,) array
-        The best design of each stage that had one.
-    time_steps : dict of int to float
-        In which these were evaluated.
-    best_stage : int or None
-        Stage of the best design of all; None if no evaluation succeeded.
-    stop_reason : str
-        Empty if the run was not finished.
     summary : dict
         That of `case.summarise`; empty if there is none yet.
+    drawing : dict of int to (D,) array of bool
+        Which design particles a design drawn by hand has, for each coarsening of the stages; empty
+        if there is none.
     """
 
-    scene: Scene
-    settings: Settings
+    run: Optimisation
     versions: dict[str, str]
-    history: dict[str, NDArray]
-    designs: dict[int, NDArray[np.float64]]
-    time_steps: dict[int, float]
-    best_stage: int | None
-    stop_reason: str
-    summary: dict[str, Any]
+    summary: dict[str, Any] = field(default_factory=dict)
+    drawing: dict[int, NDArray[np.bool_]] = field(default_factory=dict)
+
+    @property
+    def scene(self) -> Scene:
+        """Of the run."""
+        return self.run.scene
+
+    @property
+    def settings(self) -> Settings:
+        """Of the run."""
+        return self.run.settings
+
+    @property
+    def stop_reason(self) -> str:
+        """Empty if the run was not finished."""
+        return self.run.stop_reason
+
+    @property
+    def history(self) -> dict[str, NDArray]:
+        """Columns of all evaluations, named as the fields of `Iteration`."""
+        names = (*COLUMNS, "failure")
+        return {name: np.array([getattr(i, name) for i in self.run.history]) for name in names}
+
+    @property
+    def designs(self) -> dict[int, NDArray[np.float64]]:
+        """The best design of each stage that had one."""
+        return {stage: item.x for stage, item in self.run.best.items()}
 
     @property
     def best(self) -> NDArray[np.float64]:
@@ -78,21 +101,33 @@ class RunFile:
         RunFileError
             If there is none: the run failed or was stopped before its first evaluation.
         """
-        return self.designs[self._stage(None)]
+        return self.candidate().x
 
     def problem(self, stage: int | None = None) -> Problem:
         """The problem that a stage solved, by default that of the best design."""
-        index = self._stage(stage)
-        return self.settings.stages[index].problem(self.scene, self.time_steps[index])
+        item = self.candidate(stage)
+        return self.settings.stages[item.stage].problem(self.scene, item.time_step)
 
-    def _stage(self, stage: int | None) -> int:
-        index = self.best_stage if stage is None else stage
-        if index not in self.designs:
-            raise RunFileError(f"the run file holds no design of stage {index}")
-        return index
+    def candidate(self, stage: int | None = None) -> Candidate:
+        """The best evaluation of a stage, by default of all.
+
+        Raises
+        ------
+        RunFileError
+            If there is none.
+        """
+        if not self.run.best or (stage is not None and stage not in self.run.best):
+            where = "" if stage is None else f" of stage {stage}"
+            raise RunFileError(f"the run file holds no design{where}: no evaluation succeeded yet")
+        return self.run.result if stage is None else self.run.best[stage]
 
 
-def write(path: Path, run: Optimisation, summary: Mapping[str, Any] | None = None) -> None:
+def write(
+    path: Path,
+    run: Optimisation,
+    summary: Mapping[str, Any] | None = None,
+    drawing: Mapping[int, NDArray[np.bool_]] | None = None,
+) -> None:
     """Write a run as it stands; an older file of that name is replaced only by a complete one.
 
     Parameters
@@ -101,6 +136,8 @@ def write(path: Path, run: Optimisation, summary: Mapping[str, Any] | None = Non
     run : Optimisation
     summary : mapping, optional
         Of a finished run.
+    drawing : mapping of int to (D,) array of bool, optional
+        As in `RunFile`.
 
     Raises
     ------
@@ -111,57 +148,38 @@ def write(path: Path, run: Optimisation, summary: Mapping[str, Any] | None = Non
     with h5py.File(f"run-{uuid4()}", "w", driver="core", backing_store=False) as file:
         _fill(file, run)
         file.attrs["summary"] = json.dumps(dict(summary or {}))
+        for coarsening, there in (drawing or {}).items():
+            file.create_dataset(f"drawing/{coarsening}", data=there, dtype="?")
+        file.attrs["digest"] = digest(file)
         file.flush()
         image = file.id.get_file_image()
     replace_file(Path(path), image)
-
-
-def replace_file(path: Path, content: bytes) -> None:
-    """Write a file that is complete or absent; an older one stays until the new one is complete.
-
-    Raises
-    ------
-    StorageError
-        If it cannot be written.
-    """
-    new = None
-    try:
-        handle, name = tempfile.mkstemp(prefix=f".{path.name}-", dir=path.parent)
-        new = Path(name)
-        with os.fdopen(handle, "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        new.chmod(0o644)
-        os.replace(new, path)
-    except OSError as error:
-        raise StorageError(
-            f"cannot write {len(content)} bytes to {path}: {error}; make room or choose another "
-            "folder"
-        ) from error
-    finally:
-        if new is not None:
-            new.unlink(missing_ok=True)
 
 
 def _fill(file: h5py.File, run: Optimisation) -> None:
     file.attrs["format"], file.attrs["version"] = FORMAT, VERSION
     file.attrs["scene"] = run.scene.to_json()
     file.attrs["settings"] = json.dumps(dataclasses.asdict(run.settings))
-    file.attrs["versions"] = json.dumps(_versions())
+    file.attrs["versions"] = json.dumps(versions())
     file.attrs["stop_reason"] = run.stop_reason
+    file.attrs["leg"] = run.leg
     for name in COLUMNS:
         column = np.array([getattr(item, name) for item in run.history], dtype=float)
         file.create_dataset(f"history/{name}", data=column, dtype="f8")
     file.create_dataset(
         "history/failure", data=[i.failure for i in run.history], dtype=h5py.string_dtype()
     )
-    for stage, item in run.best.items():
-        group = file.create_group(f"stages/{stage}")
-        group.create_dataset("x", data=item.x, dtype="f8")
-        group.create_dataset("gamma", data=item.gamma, dtype="f8")
-        for name in COLUMNS:
-            group.attrs[name] = getattr(item, name)
+    for number, leg in enumerate(run.legs):
+        group = file.create_group(f"legs/{number}")
+        group.create_dataset("x", data=leg.x, dtype="f8")
+        for name in ("start", "stage", "reason", "gave_up"):
+            group.attrs[name] = getattr(leg, name)
+        for stage, item in leg.best.items():
+            _write_candidate(group, f"stages/{stage}", item)
+    for name in ("first", "last"):
+        _write_candidate(file, name, getattr(run, name))
+    if run.stage_state is not None:
+        _write_stage(file.create_group("stage"), run.stage_state)
     if run.best:
         x, gamma = run.result.x, run.result.gamma
         group = file.create_group("best")
@@ -170,7 +188,50 @@ def _fill(file: h5py.File, run: Optimisation) -> None:
             group.create_dataset(name, data=value, dtype="f8")
 
 
-def _versions() -> dict[str, str]:
+def _write_candidate(parent: h5py.Group, name: str, item: Candidate | None) -> None:
+    if item is None:
+        return
+    group = parent.create_group(name)
+    group.create_dataset("x", data=item.x, dtype="f8")
+    group.create_dataset("gamma", data=item.gamma, dtype="f8")
+    for key, value in item.numbers().items():
+        group.attrs[key] = value
+
+
+def _write_stage(group: h5py.Group, state: StageState) -> None:
+    group.attrs["time_step"], group.attrs["failures"] = state.time_step, state.failures
+    for name in ("values", "gradient", "farthest_gradient"):
+        group.create_dataset(name, data=getattr(state, name), dtype="f8")
+    _write_candidate(group, "farthest", state.farthest)
+    for name, value in state.mma.items():
+        group.create_dataset(f"mma/{name}", data=value, dtype="f8")
+
+
+def digest(file: h5py.File) -> str:
+    """SHA-256 of all that an open run file holds, in hexadecimal."""
+    whole = hashlib.sha256()
+
+    def add(name: str, item: Any) -> None:
+        whole.update(f"{name}\n".encode())
+        for key in sorted(item.attrs):
+            if (name, key) != ("/", "digest"):
+                whole.update(f"{key} = {item.attrs[key]!r}\n".encode())
+        if isinstance(item, h5py.Dataset):
+            whole.update(f"{item.shape} {item.dtype}\n".encode())
+            values = item[()]
+            is_text = h5py.check_string_dtype(item.dtype) is not None
+            whole.update(repr(values.tolist()).encode() if is_text else values.tobytes())
+
+    add("/", file)
+    names: list[str] = []
+    file.visit(names.append)
+    for name in sorted(names):
+        add(name, file[name])
+    return whole.hexdigest()
+
+
+def versions() -> dict[str, str]:
+    """Of this package and of those it computes with."""
     import numba
     import scipy
 
@@ -196,34 +257,9 @@ def read(path: Path) -> RunFile:
     if not path.is_file():
         raise RunFileError(f"{path} is not there; give the path of a run.h5")
     try:
-        with h5py.File(path, "r") as file:
-            if file.attrs.get("format") != FORMAT:
-                raise RunFileError(f"{path} is HDF5 but no run file of mpmopt")
-            if file.attrs["version"] != VERSION:
-                raise RunFileError(
-                    f"{path} is a run file of version {file.attrs['version']}, this mpmopt reads "
-                    f"version {VERSION}; its versions: {file.attrs.get('versions')}"
-                )
-            settings = json.loads(file.attrs["settings"])
-            settings["stages"] = tuple(Stage(**stage) for stage in settings["stages"])
-            history: dict[str, Any] = {name: _numbers(file, f"history/{name}") for name in COLUMNS}
-            history["failure"] = file["history/failure"].asstr()[:]
-            stages = sorted(int(name) for name in file["stages"]) if "stages" in file else []
-            if any(not 0 <= stage < len(settings["stages"]) for stage in stages):
-                raise ValueError(f"designs of stages {stages} of {len(settings['stages'])}")
-            if len({len(column) for column in history.values()}) != 1:
-                raise ValueError("the history's columns have different lengths")
-            return RunFile(
-                scene=Scene.from_json(file.attrs["scene"]),
-                settings=Settings(**settings),
-                versions=json.loads(file.attrs["versions"]),
-                history=history,
-                designs={stage: _numbers(file, f"stages/{stage}/x") for stage in stages},
-                best_stage=int(file["best"].attrs["stage"]) if "best" in file else None,
-                time_steps={k: float(file[f"stages/{k}"].attrs["time_step"]) for k in stages},
-                stop_reason=str(file.attrs["stop_reason"]),
-                summary=dict(json.loads(file.attrs["summary"])),
-            )
+        # Run files are replaced as a whole, so none needs a lock; some file systems have none.
+        with h5py.File(path, "r", locking=False) as file:
+            return _read(file, path)
     except MpmoptError as error:
         if isinstance(error, RunFileError):
             raise
@@ -232,8 +268,99 @@ def read(path: Path) -> RunFile:
         raise RunFileError(f"{path} is no run file, or damaged: {error}") from error
 
 
-def _numbers(file: h5py.File, name: str) -> NDArray[np.float64]:
-    dataset = file[name]
+def _read(file: h5py.File, path: Path) -> RunFile:
+    if file.attrs.get("format") != FORMAT:
+        raise RunFileError(f"{path} is HDF5 but no run file of mpmopt")
+    if file.attrs["version"] != VERSION:
+        raise RunFileError(
+            f"{path} is a run file of version {file.attrs['version']}, this mpmopt reads version "
+            f"{VERSION}; its versions: {file.attrs.get('versions')}"
+        )
+    found, wanted = digest(file), str(file.attrs["digest"])
+    if found != wanted:
+        raise RunFileError(
+            f"{path} is damaged: its content has the digest {found[:12]}..., its own is "
+            f"{wanted[:12]}...; take a copy of it"
+        )
+    settings = json.loads(file.attrs["settings"])
+    settings["stages"] = tuple(Stage(**stage) for stage in settings["stages"])
+    stages = len(settings["stages"])
+    legs = [_read_leg(file[f"legs/{number}"], stages) for number in range(len(file["legs"]))]
+    run = Optimisation(
+        scene=Scene.from_json(file.attrs["scene"]),
+        settings=Settings(**settings),
+        legs=legs,
+        leg=int(file.attrs["leg"]),
+        history=_read_history(file["history"]),
+        first=_read_candidate(file, "first"),
+        last=_read_candidate(file, "last"),
+        stage_state=_read_stage(file["stage"]) if "stage" in file else None,
+        stop_reason=str(file.attrs["stop_reason"]),
+    )
+    if not 0 <= run.leg < len(legs):
+        raise ValueError(f"leg {run.leg} of {len(legs)}")
+    return RunFile(
+        run,
+        versions=json.loads(file.attrs["versions"]),
+        summary=dict(json.loads(file.attrs["summary"])),
+        drawing={int(name): item[:] for name, item in file.get("drawing", {}).items()},
+    )
+
+
+def _read_history(group: h5py.Group) -> list[Iteration]:
+    columns: dict[str, Any] = {name: _numbers(group, name).tolist() for name in COLUMNS}
+    columns["failure"] = group["failure"].asstr()[:].tolist()
+    for name in WHOLE:
+        columns[name] = [int(value) for value in columns[name]]
+    if len({len(column) for column in columns.values()}) != 1:
+        raise ValueError("the history's columns have different lengths")
+    return [Iteration(**dict(zip(columns, row))) for row in zip(*columns.values())]
+
+
+def _read_leg(group: h5py.Group, stages: int) -> Leg:
+    best = {}
+    for name in sorted(group.get("stages", ()), key=int):
+        item = _read_candidate(group["stages"], name)
+        if item is None or item.stage != int(name) or not 0 <= item.stage < stages:
+            raise ValueError(f"a design of stage {name} of {stages}")
+        best[item.stage] = item
+    attributes = group.attrs
+    return Leg(
+        start=int(attributes["start"]),
+        x=_numbers(group, "x"),
+        stage=int(attributes["stage"]),
+        reason=str(attributes["reason"]),
+        gave_up=bool(attributes["gave_up"]),
+        best=best,
+    )
+
+
+def _read_candidate(parent: h5py.Group, name: str) -> Candidate | None:
+    if name not in parent:
+        return None
+    group = parent[name]
+    numbers: dict[str, Any] = {key: float(group.attrs[key]) for key in COLUMNS}
+    numbers.update({key: int(group.attrs[key]) for key in WHOLE})
+    failure = str(group.attrs["failure"])
+    return Candidate(
+        **numbers, failure=failure, x=_numbers(group, "x"), gamma=_numbers(group, "gamma")
+    )
+
+
+def _read_stage(group: h5py.Group) -> StageState:
+    return StageState(
+        time_step=float(group.attrs["time_step"]),
+        failures=int(group.attrs["failures"]),
+        values=_numbers(group, "values"),
+        gradient=_numbers(group, "gradient"),
+        farthest=_read_candidate(group, "farthest"),
+        farthest_gradient=_numbers(group, "farthest_gradient"),
+        mma={name: item[()] for name, item in group["mma"].items()},
+    )
+
+
+def _numbers(group: h5py.Group, name: str) -> NDArray[np.float64]:
+    dataset = group[name]
     if not isinstance(dataset, h5py.Dataset) or dataset.dtype != np.float64 or dataset.ndim != 1:
-        raise ValueError(f"{name} is no column of 64-bit numbers")
+        raise ValueError(f"{group.name}/{name} is no column of 64-bit numbers")
     return np.asarray(dataset[:], dtype=float)

@@ -13,8 +13,8 @@ import pytest
 from walker import CASES, slanted_legs, walker
 
 from mpmopt import runfile
-from mpmopt.case import Case, ProgressBar, main, run
-from mpmopt.errors import StorageError
+from mpmopt.case import Case, ProgressBar, main, resume, run
+from mpmopt.errors import RunFileError, StorageError
 from mpmopt.optimize import Settings, Stage, optimise
 from mpmopt.problem import Problem
 
@@ -25,6 +25,11 @@ SMALL = Case(
         least_iterations=12,
         most_iterations=15,
     ),
+    slanted_legs,
+)
+TINY = Case(
+    dataclasses.replace(SMALL.scene, steps=10),
+    Settings(SMALL.settings.stages[:1], window=1, least_iterations=2, most_iterations=2),
     slanted_legs,
 )
 ROOT = Path(__file__).parent.parent
@@ -79,12 +84,35 @@ def test_the_folder_holds_run_summary_and_pictures(folder):
     assert kept.problem().value(kept.best) == summary["optimised"]
 
 
-def test_an_earlier_run_is_never_overwritten(folder):
+def test_a_finished_run_is_left_as_it_is(folder):
+    out, summary = folder
+    before = (out / "run.h5").read_bytes()
+    assert run(SMALL, out) == summary
+    assert resume(out / "run.h5") == summary
+    assert (out / "run.h5").read_bytes() == before
+
+
+def test_a_run_of_another_case_is_never_overwritten(folder):
     out, _ = folder
     before = (out / "run.h5").read_bytes()
-    with pytest.raises(StorageError, match="earlier run"):
-        run(SMALL, out)
+    other = dataclasses.replace(SMALL, scene=dataclasses.replace(SMALL.scene, steps=10))
+    with pytest.raises(StorageError, match="earlier run of another case"):
+        run(other, out)
     assert (out / "run.h5").read_bytes() == before
+
+
+def test_foreign_files_are_overwritten_only_by_force(tmp_path):
+    (tmp_path / "design.png").write_text("somebody's")
+    with pytest.raises(StorageError, match=r"design\.png.*--force"):
+        run(TINY, tmp_path)
+    assert (tmp_path / "design.png").read_text() == "somebody's"
+    assert [path.name for path in tmp_path.iterdir()] == ["design.png"]
+    run(TINY, tmp_path, force=True)
+    assert (tmp_path / "design.png").read_bytes().startswith(b"\x89PNG")
+    (tmp_path / "run.h5").write_text("somebody's too")
+    with pytest.raises(RunFileError):
+        run(TINY, tmp_path)
+    assert run(TINY, tmp_path, force=True)["evaluations"] == 2
 
 
 def test_a_folder_that_cannot_be_made_is_a_storage_error(tmp_path):
@@ -94,30 +122,13 @@ def test_a_folder_that_cannot_be_made_is_a_storage_error(tmp_path):
 
 
 def test_the_command_prints_the_summary_or_an_error(tmp_path, capsys):
-    tiny = Case(
-        dataclasses.replace(SMALL.scene, steps=10),
-        Settings(SMALL.settings.stages[:1], window=1, least_iterations=2, most_iterations=2),
-        slanted_legs,
-    )
-    assert (
-        main("A case.", {"default": SMALL, "tiny": tiny}, ["--tiny", "--out", str(tmp_path)]) == 0
-    )
+    cases = {"default": SMALL, "tiny": TINY}
+    assert main("A case.", cases, ["--tiny", "--out", str(tmp_path)]) == 0
     printed = capsys.readouterr().out.splitlines()
     assert printed[0].split() == ["start", "0.2031"]
     assert printed[-1].startswith("stop reason  ")
-    assert (
-        main("A case.", {"default": SMALL, "tiny": tiny}, ["--tiny", "--out", str(tmp_path)]) == 1
-    )
+    assert main("A case.", cases, ["--out", str(tmp_path)]) == 1
     assert capsys.readouterr().err.startswith("StorageError: ")
-
-
-def test_an_interrupt_says_where_the_run_is(tmp_path, capsys, monkeypatch):
-    def interrupted(self, x):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(Problem, "evaluate", interrupted)
-    assert main("A case.", {"default": SMALL}, ["--out", str(tmp_path)]) == 130
-    assert "run.h5 holds the run so far" in capsys.readouterr().err
 
 
 def test_progress_becomes_log_lines_off_a_terminal(capsys):

@@ -226,9 +226,10 @@ def test_an_optimisation_records_steps_and_margins():
     material = scene.material
     stage = Stage(2.0, material.mass_floor, material.stiffness_floor, scene.time_step)
     settings = Settings((stage,), least_iterations=1, most_iterations=2)
-    run = optimise(scene, settings, x)
+    designs = []
+    run = optimise(scene, settings, x, [lambda run: designs.append(run.last)])
     assert run.redone_evaluations == len(run.history) == 2
-    for item in run.history:
+    for item in designs:
         assert (item.redone, item.time_step) == (1, scene.time_step / 2)
         again = plain(problem, item.time_step).evaluate(item.x)
         assert again.value == item.objective

@@ -54,7 +54,8 @@ def test_a_run_is_read_back_as_it_was(run, path):
 
 def test_a_halved_time_step_is_remembered(run, tmp_path):
     best = {0: dataclasses.replace(run.best[0], time_step=2e-3)}
-    runfile.write(tmp_path / "run.h5", dataclasses.replace(run, best=best))
+    legs = [dataclasses.replace(run.legs[0], best=best)]
+    runfile.write(tmp_path / "run.h5", dataclasses.replace(run, legs=legs))
     assert runfile.read(tmp_path / "run.h5").problem().scene.time_step == 2e-3
 
 
@@ -69,11 +70,13 @@ def test_the_best_design_is_there_by_name(run, path):
 
 def test_an_unfinished_run_can_be_read(run, tmp_path):
     path = tmp_path / "run.h5"
-    runfile.write(path, dataclasses.replace(run, history=run.history[:1], best={}, stop_reason=""))
+    legs = [dataclasses.replace(run.legs[0], best={})]
+    stopped = dataclasses.replace(run, history=run.history[:1], legs=legs, stop_reason="")
+    runfile.write(path, stopped)
     back = runfile.read(path)
     assert back.designs == {}
     assert back.stop_reason == ""
-    with pytest.raises(RunFileError, match="no design of stage None"):
+    with pytest.raises(RunFileError, match="holds no design: no evaluation succeeded"):
         _ = back.best
 
 
@@ -82,9 +85,12 @@ def test_writing_again_replaces_the_file_and_leaves_nothing_else(run, path):
     assert [file.name for file in path.parent.iterdir()] == ["run.h5"]
 
 
-def damaged(path, change):
+def damaged(path, change, seal=True):
+    """A run file that was changed; sealed again, so that its digest does not tell."""
     with h5py.File(path, "r+") as file:
         change(file)
+        if seal:
+            file.attrs["digest"] = runfile.digest(file)
     return path
 
 
@@ -99,19 +105,38 @@ def damaged(path, change):
         lambda f: f.attrs.update(settings='{"stages": []}'),
         lambda f: f.attrs.update(settings='{"stages": [], "speed": 3}'),
         lambda f: f.attrs.update(settings=f.attrs["settings"].replace("0.5", '"x"')),
-        lambda f: f.move("stages/1", "stages/7"),
+        lambda f: f.move("legs/0/stages/1", "legs/0/stages/7"),
         lambda f: (f["history"].pop("beta"), f.create_dataset("history/beta", data=[1.0])),
         lambda f: f.attrs.pop("settings"),
         lambda f: f.pop("history/objective"),
-        lambda f: f.create_group("stages/x"),
-        lambda f: f["stages/0"].pop("x"),
-        lambda f: (f["stages/0"].pop("x"), f.create_dataset("stages/0/x", data=["a"])),
+        lambda f: f.create_group("legs/0/stages/x"),
+        lambda f: f["legs/0/stages/0"].pop("x"),
+        lambda f: (
+            f["legs/0/stages/0"].pop("x"),
+            f.create_dataset("legs/0/stages/0/x", data=["a"]),
+        ),
         lambda f: (f["history"].pop("beta"), f.create_dataset("history/beta", data=[[1.0]])),
     ],
 )
 def test_a_damaged_run_file_is_refused(path, change):
     with pytest.raises(RunFileError, match=r"run\.h5"):
         runfile.read(damaged(path, change))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda f: f["legs/0/stages/0/x"].write_direct(np.nextafter(f["legs/0/stages/0/x"][:], 2.0)),
+        lambda f: f.attrs.update(stop_reason="other"),
+        lambda f: f["last"].attrs.update(objective=9.0),
+        lambda f: f.pop("best"),
+        lambda f: f.create_group("new"),
+        lambda f: f.attrs.pop("digest"),
+    ],
+)
+def test_whatever_changed_since_it_was_written_is_noticed(path, change):
+    with pytest.raises(RunFileError, match=r"run\.h5.*dig"):
+        runfile.read(damaged(path, change, seal=False))
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.9, 0.999])

@@ -1,0 +1,86 @@
+"""Files that are complete or absent, in folders that one process at a time works in."""
+
+from __future__ import annotations
+
+import logging
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from mpmopt.errors import StorageError
+
+try:
+    import fcntl
+except ImportError:  # no such locks on Windows
+    fcntl = None  # type: ignore[assignment]
+
+logger = logging.getLogger(__name__)
+
+
+def replace_file(path: Path, content: bytes) -> None:
+    """Write a file that is complete or absent; an older one stays until the new one is complete.
+
+    Raises
+    ------
+    StorageError
+        If it cannot be written.
+    """
+    new = None
+    try:
+        handle, name = tempfile.mkstemp(prefix=_unfinished(path), dir=path.parent)
+        new = Path(name)
+        with os.fdopen(handle, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        new.chmod(0o644)
+        os.replace(new, path)
+    except OSError as error:
+        raise StorageError(
+            f"cannot write {len(content)} bytes to {path}: {error}; make room or choose another "
+            "folder"
+        ) from error
+    finally:
+        if new is not None:
+            new.unlink(missing_ok=True)
+
+
+def _unfinished(path: Path) -> str:
+    return f".{path.name}-"
+
+
+@contextmanager
+def locked(path: Path) -> Iterator[None]:
+    """Let no other process of this kind work on a file, and remove what killed ones left of it.
+
+    The lock is one on the file's folder: it leaves nothing behind and ends with the process. File
+    systems without locks only warn.
+
+    Raises
+    ------
+    StorageError
+        If another process has the lock, or there is no such folder.
+    """
+    try:
+        folder = os.open(path.parent, os.O_RDONLY)
+    except OSError as error:
+        raise StorageError(f"cannot open the folder of {path}: {error}") from error
+    try:
+        if fcntl is not None:
+            try:
+                fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                raise StorageError(
+                    f"another process is at work in {path.parent}; wait for it, or choose another "
+                    "folder"
+                ) from error
+            except OSError as error:
+                logger.warning("no lock on %s: %s; start no second process there", path, error)
+        for left in path.parent.glob(f"{_unfinished(path)}*"):
+            with suppress(OSError):
+                left.unlink()
+        yield
+    finally:
+        os.close(folder)

@@ -1,0 +1,231 @@
+"""An optimisation as it stands: its evaluations, its best designs, and what it needs to go on."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpmopt.errors import DesignError
+from mpmopt.problem import Problem
+from mpmopt.scene import Scene
+
+if TYPE_CHECKING:
+    from mpmopt.optimize import Settings
+
+
+@dataclass(frozen=True, kw_only=True)
+class Iteration:
+    """One evaluation, in numbers.
+
+    Attributes
+    ----------
+    start : int
+        Index of the start that it goes back to.
+    stage : int
+        Index of the stage.
+    beta, move_limit : float
+        In force during the evaluation.
+    time_step : float
+        That the values are of; of the last attempt if it failed.
+    objective : float
+        L, or not a number if the evaluation failed.
+    greyness : float
+        Mean of 4 gamma (1 - gamma).
+    projected_gradient : float
+        Greatest change of L per unit of x that the bounds leave free.
+    step : float
+        Greatest change of a variable since the last evaluation, as a fraction of its range.
+    seconds : float
+        Since the optimisation began, without the time between a stop and going on.
+    post_processed : float
+        L without void, or not a number if the stage does not ask for it or it failed.
+    redone : int
+        How often the stage's time step was halved for this evaluation.
+    courant, spin, jacobian, stretch : float
+        Its `simulate.Margins`, or not a number if it failed.
+    failure : str
+        Why the evaluation failed, or empty.
+    """
+
+    start: int
+    stage: int
+    beta: float
+    time_step: float
+    move_limit: float
+    objective: float
+    greyness: float
+    projected_gradient: float
+    step: float
+    seconds: float
+    post_processed: float = np.nan
+    redone: int = 0
+    courant: float = np.nan
+    spin: float = np.nan
+    jacobian: float = np.nan
+    stretch: float = np.nan
+    failure: str = ""
+
+    def numbers(self) -> dict[str, Any]:
+        """The fields above by name, without the design of a `Candidate`."""
+        return {item.name: getattr(self, item.name) for item in dataclasses.fields(Iteration)}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Candidate(Iteration):
+    """An evaluation with the design that was evaluated.
+
+    Attributes
+    ----------
+    x : (n,) array
+        Design variables.
+    gamma : (D,) array
+        Their material density.
+    """
+
+    x: NDArray[np.float64]
+    gamma: NDArray[np.float64]
+
+
+@dataclass
+class Leg:
+    """How far one start has come.
+
+    Attributes
+    ----------
+    start : int
+        Its index.
+    x : (n,) array
+        The design that its stage began with.
+    stage : int
+        The stage that it is in, or after the last.
+    reason : str
+        Why its last stage ended; empty before.
+    gave_up : bool
+    best : dict of int to Candidate
+        The best evaluation of each stage that had one.
+    """
+
+    start: int
+    x: NDArray[np.float64]
+    stage: int = 0
+    reason: str = ""
+    gave_up: bool = False
+    best: dict[int, Candidate] = field(default_factory=dict)
+
+    @property
+    def merit(self) -> tuple[int, float]:
+        """What the starts are compared by: the last stage that had a design, and its best."""
+        if not self.best:
+            return -1, -np.inf
+        item = self.best[max(self.best)]
+        return item.stage, item.objective if np.isnan(item.post_processed) else item.post_processed
+
+
+@dataclass(frozen=True)
+class StageState:
+    """A stage just after an evaluation: all that its next step depends on.
+
+    Attributes
+    ----------
+    time_step : float
+    failures : int
+        Failed evaluations in a row.
+    values : (k,) array
+        Objectives of those that succeeded.
+    gradient : (n,) array
+        Of the last evaluation, empty if it failed.
+    farthest : Candidate or None
+        The one with the largest objective.
+    farthest_gradient : (n,) array
+        Its gradient, empty if there is none.
+    mma : mapping of str to array or number
+        `MovingAsymptotes.state` before the step.
+    """
+
+    time_step: float
+    failures: int
+    values: NDArray[np.float64]
+    gradient: NDArray[np.float64]
+    farthest: Candidate | None
+    farthest_gradient: NDArray[np.float64]
+    mma: Mapping[str, Any]
+
+
+@dataclass
+class Optimisation:
+    """An optimisation as it stands: what `optimise` hands to callbacks and returns.
+
+    Attributes
+    ----------
+    scene : Scene
+    settings : Settings
+    legs : list of Leg
+        One for each start.
+    leg : int
+        Index of the one that goes on.
+    history : list of Iteration
+        All evaluations.
+    first, last : Candidate or None
+        The first and the last evaluation.
+    stage_state : StageState or None
+        Of the stage that is under way, after its last evaluation.
+    stop_reason : str
+        A sentence; empty while it runs.
+    """
+
+    scene: Scene
+    settings: Settings
+    legs: list[Leg]
+    leg: int = 0
+    history: list[Iteration] = field(default_factory=list)
+    first: Candidate | None = None
+    last: Candidate | None = None
+    stage_state: StageState | None = None
+    stop_reason: str = ""
+
+    @property
+    def best(self) -> dict[int, Candidate]:
+        """The best evaluation of each stage that had one, of the start that goes on."""
+        return self.legs[self.leg].best
+
+    @property
+    def result(self) -> Candidate:
+        """The best evaluation on the last stage's grid.
+
+        That is the one that goes farthest without void, where stages ask for that; else the best of
+        the last stage that had one, whose projection is the sharpest.
+
+        Raises
+        ------
+        DesignError
+            If no evaluation succeeded.
+        """
+        if not self.best:
+            last = self.history[-1].failure if self.history else "none was made"
+            raise DesignError(f"no evaluation succeeded; the last: {last}")
+        stages = self.settings.stages
+        grid = stages[max(self.best)].coarsening
+        return max(
+            (item for stage, item in self.best.items() if stages[stage].coarsening == grid),
+            key=lambda item: (np.nan_to_num(item.post_processed, nan=-np.inf), item.stage),
+        )
+
+    def problem(self) -> Problem:
+        """The problem that `result` solves, in the time step that it was evaluated with."""
+        best = self.result
+        return self.settings.stages[best.stage].problem(self.scene, best.time_step)
+
+    @property
+    def failed_evaluations(self) -> int:
+        """Number of evaluations that failed."""
+        return sum(bool(iteration.failure) for iteration in self.history)
+
+    @property
+    def redone_evaluations(self) -> int:
+        """Number of evaluations that were redone with a shorter time step."""
+        return sum(iteration.redone > 0 for iteration in self.history)
