@@ -6,7 +6,9 @@ import math
 import os
 import shutil
 import tempfile
+import zlib
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -162,6 +164,7 @@ class Checkpoints:
         self.path: Path | None = None
         self._file: h5py.File | None = None
         self._store: dict[str, Any]  # arrays or datasets
+        self._sums: dict[tuple[int, str], tuple[tuple[slice, ...], int]] = {}  # of a file's parts
         if schedule.in_memory:
             try:
                 self._store = {
@@ -193,6 +196,9 @@ class Checkpoints:
             self._take_room(self.path.stat().st_size)
             self._file = h5py.File(self.path, "r+")
             self._store = dict(self._file)
+            if self._target is None:
+                with suppress(OSError):  # some systems remove no open file
+                    self.path.unlink()  # nobody can touch it, and nothing is left if we are killed
         except OSError as error:
             self._remove()
             raise StorageError(
@@ -226,8 +232,11 @@ class Checkpoints:
     def write(self, segment: int, **arrays: NDArray) -> None:
         """Store named arrays of a segment; they may be shorter than the room for them."""
         for name, array in arrays.items():
-            where = (segment, *map(slice, array.shape))
-            self._store[name][where] = array
+            where = tuple(map(slice, array.shape))
+            place = (segment, *where)
+            self._store[name][place] = array
+            if not self.schedule.in_memory:
+                self._sums[segment, name] = where, _checksum(array)
 
     def read(self, segment: int, name: str) -> NDArray:
         """An array of a segment, with all the room that it has.
@@ -238,7 +247,12 @@ class Checkpoints:
             If the file lost it.
         """
         try:
-            return np.asarray(self._store[name][segment])
+            array = np.asarray(self._store[name][segment])
+            if (segment, name) in self._sums:
+                where, checksum = self._sums[segment, name]
+                if _checksum(array[where]) != checksum:
+                    raise OSError("it is not what was written")
+            return array
         except (OSError, KeyError, RuntimeError) as error:
             raise StorageError(
                 f"cannot read {name} of segment {segment} back from {self.path or 'memory'}: "
@@ -279,6 +293,10 @@ class Checkpoints:
         if kind is not None:
             self._target = None  # incomplete
         self.close()
+
+
+def _checksum(array: NDArray) -> int:
+    return zlib.crc32(np.ascontiguousarray(array).data)
 
 
 def _is_store(path: Path) -> bool:

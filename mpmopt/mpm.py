@@ -41,6 +41,7 @@ Sources: Hu et al. 2018 (MLS-MPM), Jiang et al. 2015 (APIC), Sato et al. 2023 (a
 """
 
 import functools
+import logging
 import math
 import operator
 import sys
@@ -62,9 +63,23 @@ TILE = 16
 # How `advance` ended.
 DONE, WINDOW_TOO_SMALL, PART_TOO_SMALL, ESCAPED, INVERTED, ABANDONED = range(6)
 
+
+def _can_cache() -> bool:
+    """Whether Numba finds a folder to keep compiled kernels in; without one it would raise."""
+    try:
+        njit(cache=True)(_can_cache)
+    except RuntimeError:
+        logging.getLogger(__name__).warning(
+            "no folder to keep compiled kernels in, each start compiles them anew; let the "
+            "environment variable NUMBA_CACHE_DIR name one"
+        )
+        return False
+    return True
+
+
 # No "nnan" or "ninf": comparisons must see what is not a number.
 OPTIONS: dict[str, Any] = {
-    "cache": True,
+    "cache": _can_cache(),
     "nogil": True,
     "error_model": "numpy",
     "fastmath": {"contract", "reassoc", "nsz", "arcp"},
@@ -616,17 +631,23 @@ def inertia_adjoint(old, body, tile, bar, body_bar, first, last):
 
 
 @jit
+def momentum(state, body, tile, g, t, k):
+    """What particle k of a group puts on nodes: (m v_x, m v_y, m, 0), columns of A dx likewise."""
+    m, A, row = number(body.mass, g, k), tile.affine, 4 * t
+    zero = 0.0 * m
+    q = pack(m * number(state, 12 * g + 2, k), m * number(state, 12 * g + 3, k), m, zero)
+    a0 = pack(number(A, row, k), number(A, row + 2, k), zero, zero)
+    a1 = pack(number(A, row + 1, k), number(A, row + 3, k), zero, zero)
+    return q, a0, a1
+
+
+@jit
 def p2g(state, body, tile, cells, first, last):
     """Particle to grid: momentum and mass (q_x, q_y, m, 0), as moments of cells."""
     for g in range(first, last):
         t = g - first
         for k in range(4):
-            m = number(body.mass, g, k)
-            zero = 0.0 * m
-            A, row = tile.affine, 4 * t
-            q = pack(m * number(state, 12 * g + 2, k), m * number(state, 12 * g + 3, k), m, zero)
-            a0 = pack(number(A, row, k), number(A, row + 2, k), zero, zero)
-            a1 = pack(number(A, row + 1, k), number(A, row + 3, k), zero, zero)
+            q, a0, a1 = momentum(state, body, tile, g, t, k)
             deposit(cells, tile, t, k, q, a0, a1)
 
 
@@ -637,12 +658,7 @@ def p2g_adjoint(state, body, world, tile, cells, bar, body_bar, first, last):
     for g in range(first, last):
         t = g - first
         for k in range(4):
-            m = number(body.mass, g, k)
-            zero = 0.0 * m
-            A, row = tile.affine, 4 * t
-            q = pack(m * number(state, 12 * g + 2, k), m * number(state, 12 * g + 3, k), m, zero)
-            a0 = pack(number(A, row, k), number(A, row + 2, k), zero, zero)
-            a1 = pack(number(A, row + 1, k), number(A, row + 3, k), zero, zero)
+            q, a0, a1 = momentum(state, body, tile, g, t, k)
             mean, along_x, along_y = moments(cells, tile, t, k)
             slope_x, slope_y = slopes(cells, tile, t, k, q, a0, a1)
             set_number(gathered, 9 * t, k, along_x[0])

@@ -1,0 +1,194 @@
+"""A run that is stopped anywhere goes on, bit for bit, as if it had not been."""
+
+import dataclasses
+import os
+import random
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import faults
+import h5py
+import numpy as np
+import pytest
+from conftest import small_scene
+
+from mpmopt import runfile
+from mpmopt.case import main, reported
+from mpmopt.errors import SimulationError, StorageError
+from mpmopt.files import locked, replace_file
+from mpmopt.interrupt import Interrupted, interruptible
+from mpmopt.optimize import Settings, Stage, go_on, optimise
+from mpmopt.problem import Problem
+
+STAGES = (
+    Stage(0.5, 1e-2, 1e-3, 4e-3),
+    Stage(2.0, 1e-2, 1e-3, 4e-3, solid=True),
+    Stage(8.0, 1e-2, 1e-3, 2e-3, solid=True, leave_out=0.1),
+)
+SETTINGS = Settings(STAGES, window=1, least_iterations=4, most_iterations=4, scouting=2)
+
+
+@pytest.fixture
+def fails(monkeypatch):
+    """Evaluations fail by their design, so that a second process sees the same: some in the middle,
+    and the first of the last stage until its step is halved."""
+    real = Problem.evaluate
+
+    def evaluate(self, x):
+        first_of_last = self.chain.beta == 8.0 and self.scene.time_step > 1e-3
+        if first_of_last or int(1e6 * abs(x[5])) % 5 == 1:
+            raise SimulationError("made to fail", 3, 1, (0.0, 0.0), "none")
+        return real(self, x)
+
+    monkeypatch.setattr(Problem, "evaluate", evaluate)
+
+
+def test_an_optimisation_goes_on_from_any_evaluation(fails, tmp_path):
+    scene = small_scene(steps=30)
+    problem = Problem(scene)
+    starts = [problem.join(0.01 * k, 1.0, -0.3 + 0.5 * k, -0.5) for k in range(2)]
+    paths: list[Path] = []
+
+    def save(run):
+        paths.append(tmp_path / f"{len(paths)}.h5")
+        runfile.write(paths[-1], run)
+
+    whole = optimise(scene, SETTINGS, starts, [save])
+    assert 0 < whole.failed_evaluations < len(whole.history)
+    assert {item.start for item in whole.history} == {0, 1}
+    assert whole.history[-1].time_step == 1e-3
+    wanted = faults.content(paths[-1])
+    for path in paths:
+        back = runfile.read(path)
+        again = go_on(back.run)
+        runfile.write(tmp_path / "again.h5", again)
+        assert faults.content(tmp_path / "again.h5") == wanted, path.name
+        seconds = [item.seconds for item in again.history]
+        assert seconds == sorted(seconds)
+
+
+def test_all_that_a_run_is_comes_back_from_its_file(fails, tmp_path):
+    scene = small_scene(steps=30)
+    run = optimise(scene, SETTINGS, [Problem(scene).join(0.0, 1.0, t, 0.0) for t in (0.1, -0.1)])
+    runfile.write(tmp_path / "run.h5", run)
+    runfile.write(tmp_path / "again.h5", runfile.read(tmp_path / "run.h5").run)
+    assert (tmp_path / "run.h5").read_bytes() == (tmp_path / "again.h5").read_bytes()
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    return faults.finished(tmp_path_factory.mktemp("whole") / "out")
+
+
+def test_a_killed_run_ends_as_it_would_have(whole, tmp_path):
+    rows = faults.kills(tmp_path, whole, 3, random.Random(1))
+    assert sum(row.done for row in rows) == 3
+    assert all(row.survived == row.done for row in rows), rows
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_ends_a_run_with_its_code_and_says_how_to_go_on(whole, tmp_path, number, code):
+    process = faults.Process(tmp_path / "out")
+    assert process.wait_for("reverse")
+    found, text = process.end(number)
+    assert found == code
+    assert f"{number.name}. Every evaluation is saved; go on with: python -m mpmopt resume" in text
+    assert "Traceback" not in text
+    assert faults.resumed(tmp_path / "out") == whole
+
+
+HANGS = """
+import ctypes, sys
+from mpmopt.interrupt import interruptible
+with interruptible("Advice."):
+    mutex = ctypes.create_string_buffer(64)
+    print("ready", flush=True)
+    while True:  # the second lock waits for ever, whatever the signal
+        ctypes.CDLL(None).pthread_mutex_lock(mutex)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="calls the C library")
+def test_a_call_that_does_not_return_is_ended_from_outside():
+    process = subprocess.Popen(
+        [sys.executable, "-c", HANGS],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    assert process.stdout.readline() == "ready\n"
+    process.send_signal(signal.SIGTERM)
+    _, text = process.communicate(timeout=50)
+    assert process.returncode == 143
+    assert "stopped by SIGTERM. Advice." in text
+
+
+def test_signals_are_given_back():
+    before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
+    with pytest.raises(Interrupted, match="SIGTERM"), interruptible("none"):
+        os.kill(os.getpid(), signal.SIGTERM)
+    assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before
+
+
+def test_an_error_is_one_line_and_exit_code_one(capsys, tmp_path):
+    def refuse():
+        raise StorageError("no room")
+
+    assert reported(refuse, tmp_path / "run.h5") == 1
+    assert capsys.readouterr().err == "StorageError: no room\n"
+
+
+def test_a_write_that_fails_loses_nothing_that_was_saved(whole, tmp_path):
+    rows = faults.full_disk(tmp_path, whole, 1, random.Random(2))
+    assert all(row.survived == row.done for row in rows), rows
+
+
+def test_scratch_files_on_disk_have_no_name_and_know_when_they_are_damaged(whole, tmp_path):
+    rows = faults.scratch(tmp_path, whole)
+    assert all(row.survived == row.done for row in rows), rows
+
+
+def test_a_second_process_on_a_run_is_refused(whole, tmp_path):
+    first = faults.Process(tmp_path / "out")
+    assert first.wait_for("forward")
+    code, text = faults.Process(tmp_path / "out").end()
+    assert code == 1
+    assert "StorageError: another process is at work" in text
+    assert first.end()[0] == 0
+    assert faults.content(tmp_path / "out" / "run.h5") == whole
+
+
+def test_a_lock_ends_and_leaves_nothing(tmp_path):
+    (tmp_path / ".run.h5-killed").write_text("half a file")
+    (tmp_path / ".other.h5-x").write_text("somebody's")
+    path = tmp_path / "run.h5"
+    with locked(path), pytest.raises(StorageError, match="another process"), locked(path):
+        pass
+    with locked(path):
+        replace_file(path, b"1")
+    assert sorted(item.name for item in tmp_path.iterdir()) == [".other.h5-x", "run.h5"]
+
+
+def test_resume_of_no_run_is_an_error(tmp_path, capsys):
+    command = [sys.executable, "-m", "mpmopt", "resume", str(tmp_path / "no" / "run.h5")]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert done.stderr.startswith("StorageError: ")
+
+
+def test_other_versions_are_warned_of(tmp_path, caplog, monkeypatch):
+    tiny = dataclasses.replace(
+        faults.SMALL,
+        scene=dataclasses.replace(faults.SMALL.scene, steps=10),
+        settings=Settings((Stage(1.0, 1e-2, 1e-3, 8e-4),), window=1, least_iterations=2,
+                          most_iterations=2),
+    )  # fmt: skip
+    arguments = ["--out", str(tmp_path)]
+    assert main("A case.", {"default": tiny}, arguments) == 0
+    with h5py.File(tmp_path / "run.h5", "r+") as file:
+        file.attrs["summary"] = "{}"
+        file.attrs["versions"] = '{"numba": "0.1"}'
+        file.attrs["digest"] = runfile.digest(file)
+    assert main("A case.", {"default": tiny}, arguments) == 0
+    assert "digits may differ" in caplog.text
+    assert np.isfinite(runfile.read(tmp_path / "run.h5").summary["optimised"])
