@@ -7,8 +7,8 @@ __version__ = "0.1.0"
 
 _MODULES = (
     "actuation", "audit", "binary", "case", "checkpoints", "design", "discretisation", "errors",
-    "mma", "mpm", "objective", "optimize", "particles", "plot", "problem", "runfile", "scene",
-    "simulate", "verify",
+    "files", "history", "interrupt", "mma", "mpm", "objective", "optimize", "particles", "plot",
+    "problem", "runfile", "scene", "simulate", "verify",
 )  # fmt: skip
 
 

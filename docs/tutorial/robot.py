@@ -1,0 +1,29 @@
+"""A worm on a floor: two actuators in a row, each free to find its phase."""
+
+import sys
+
+from mpmopt.case import Case, main, sharpened
+from mpmopt.scene import Actuator, Design, Grid, Scene, Wall
+
+c = 1 / 64  # width of a cell
+worm = Scene(
+    grid=Grid(cells=(96, 32), dx=c),
+    time_step=8e-4,
+    steps=1250,  # one second
+    gravity=(0.0, -10.0),
+    walls=(Wall("y", 4 * c, friction=0.5),),
+    body=(
+        Design((4 * c, 4 * c), (28 * c, 9 * c)),
+        Actuator((4 * c, 9 * c), (16 * c, 12 * c)),
+        Actuator((16 * c, 9 * c), (28 * c, 12 * c)),
+    ),
+)
+
+
+def all_there(positions):
+    """What a drawn design would be, to compare with: here simply the full block."""
+    return positions[:, 0] > 0.0
+
+
+if __name__ == "__main__":
+    sys.exit(main("A worm.", {"default": Case(worm, sharpened(8e-4), all_there)}))
