@@ -44,6 +44,9 @@ class Iteration:
         Since the optimisation began, without the time between a stop and going on.
     post_processed : float
         L without void, or not a number if the stage does not ask for it or it failed.
+    finer : float
+        L without void on cells half as wide; not a number if the stage does not ask for it or the
+        design could not be its best anyway, minus infinity if it failed.
     redone : int
         How often the stage's time step was halved for this evaluation.
     courant, spin, jacobian, stretch : float
@@ -63,12 +66,19 @@ class Iteration:
     step: float
     seconds: float
     post_processed: float = np.nan
+    finer: float = np.nan
     redone: int = 0
     courant: float = np.nan
     spin: float = np.nan
     jacobian: float = np.nan
     stretch: float = np.nan
     failure: str = ""
+
+    @property
+    def counted(self) -> float:
+        """L without void, on the worse of the grids it was asked for; minus infinity if none."""
+        least = float(np.fmin(self.post_processed, self.finer))
+        return -np.inf if np.isnan(least) else least
 
     def numbers(self) -> dict[str, Any]:
         """The fields above by name, without the design of a `Candidate`."""
@@ -123,7 +133,7 @@ class Leg:
         if not self.best:
             return -1, -np.inf
         item = self.best[max(self.best)]
-        return item.stage, item.objective if np.isnan(item.post_processed) else item.post_processed
+        return item.stage, item.objective if np.isnan(item.post_processed) else item.counted
 
 
 @dataclass(frozen=True)
@@ -212,7 +222,7 @@ class Optimisation:
         grid = stages[max(self.best)].coarsening
         return max(
             (item for stage, item in self.best.items() if stages[stage].coarsening == grid),
-            key=lambda item: (np.nan_to_num(item.post_processed, nan=-np.inf), item.stage),
+            key=lambda item: (item.counted, item.stage),
         )
 
     def problem(self) -> Problem:

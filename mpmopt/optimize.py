@@ -11,11 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mpmopt import audit
 from mpmopt.binary import post_processed
 from mpmopt.checkpoints import Checkpointing
 from mpmopt.checks import count, number, share
 from mpmopt.design import greyness
-from mpmopt.errors import DesignError, SimulationError
+from mpmopt.errors import DesignError, SceneError, SimulationError
 from mpmopt.history import Candidate, Iteration, Leg, Optimisation, StageState
 from mpmopt.mma import MovingAsymptotes
 from mpmopt.problem import Problem
@@ -45,6 +46,10 @@ class Stage:
         Whether the best design is the one that goes farthest once its void is removed
         (`binary.post_processed`), which costs a forward run more, instead of as it is. The climb
         itself goes on from the one that goes farthest as it is.
+    finer : bool
+        Whether such a design counts with the lesser of this and of the same on cells half as wide
+        (`audit.finer`), so that the best is one that keeps its gain there. This costs three
+        gradients more for each design that goes farther than the best so far.
     coarsening : int
         How many of the scene's cells go into the width of this stage's: early stages need no more.
     move_limit : float
@@ -67,6 +72,7 @@ class Stage:
     stiffness_floor: float
     time_step: float
     solid: bool = False
+    finer: bool = False
     coarsening: int = 1
     move_limit: float = 0.05
     leave_out: float = 0.0
@@ -81,6 +87,8 @@ class Stage:
             raise DesignError(f"Stage: move_limit = {self.move_limit} must be at most 1")
         leave_out = share("Stage", "leave_out", self.leave_out, error=DesignError)
         object.__setattr__(self, "leave_out", leave_out)
+        if self.finer and not self.solid:
+            raise DesignError("Stage: finer = True needs solid = True")
         if self.most_iterations is not None:
             most = count("Stage", "most_iterations", self.most_iterations, 1, error=DesignError)
             object.__setattr__(self, "most_iterations", most)
@@ -393,9 +401,14 @@ class _StageRun:
         except SimulationError as error:
             failure = str(error)
             logger.warning("evaluation %d failed: %s", len(run.history), error)
-        solid = np.nan
+        solid = finer = np.nan
         if self.stage.solid and not failure:
-            solid = self._without_void(problem.at(time_step), x)
+            solid = self._without_void(post_processed, problem.at(time_step), x)
+            best = run.best.get(self.leg.stage)
+            hopeful = solid > (best.counted if best else -np.inf)
+            if self.stage.finer and hopeful:
+                finer = self._without_void(audit.finer, problem.at(time_step), x)
+                finer = -np.inf if np.isnan(finer) else finer
         before = run.last.x if run.last else x
         if before.size != x.size:  # another grid
             before = x
@@ -415,6 +428,7 @@ class _StageRun:
             step=float(np.abs(x - before).max() / 2.0),
             seconds=time.monotonic() - self.whole.began,
             post_processed=solid,
+            finer=finer,
             redone=redone,
             courant=margins.courant,
             spin=margins.spin,
@@ -439,20 +453,30 @@ class _StageRun:
             self.gradient = gradient
             if self.farthest is None or candidate.objective > self.farthest.objective:
                 self.farthest, self.farthest_gradient = candidate, gradient
-            best = run.best.get(candidate.stage)
-            if best is None or self._merit(candidate) > self._merit(best):
+            if self._is_best(candidate):
                 run.best[candidate.stage] = candidate
         run.stage_state = self.state()
 
-    def _merit(self, item: Iteration) -> tuple[float, ...]:
-        if self.stage.solid:
-            return float(np.nan_to_num(item.post_processed, nan=-np.inf)), item.objective
-        return (item.objective,)
+    def _is_best(self, item: Candidate) -> bool:
+        """Whether it is better than the best of its stage so far."""
+        best = self.run.best.get(item.stage)
+        if best is None:
+            return True
+        if not self.stage.solid:
+            return item.objective > best.objective
+        if self.stage.finer and np.isnan(item.finer):
+            return False
+        return (item.counted, item.objective) > (best.counted, best.objective)
 
-    def _without_void(self, problem: Problem, x: NDArray[np.float64]) -> float:
+    def _without_void(
+        self,
+        distance: Callable[[Problem, NDArray[np.float64]], float],
+        problem: Problem,
+        x: NDArray[np.float64],
+    ) -> float:
         try:
-            return post_processed(problem, x)
-        except SimulationError as error:
+            return distance(problem, x)
+        except (SceneError, SimulationError) as error:
             logger.warning("the design fails without void: %s", error)
             return np.nan
 
