@@ -6,9 +6,10 @@ from typing import Any
 __version__ = "0.1.0"
 
 _MODULES = (
-    "actuation", "audit", "binary", "case", "checkpoints", "design", "discretisation", "errors",
-    "files", "history", "interrupt", "mma", "mpm", "objective", "optimize", "particles", "plot",
-    "problem", "runfile", "scene", "simulate", "verify",
+    "actuation", "audit", "binary", "case", "checkpoints", "design", "discretisation", "draw",
+    "errors", "film", "files", "history", "interrupt", "mma", "motion", "mpm", "objective",
+    "optimize", "particles", "plot", "problem", "progress", "runfile", "scene", "schematic",
+    "simulate", "verify",
 )  # fmt: skip
 
 

@@ -1,25 +1,79 @@
-"""Commands on run files: ``python -m mpmopt verify DIR/run.h5`` and so on."""
+"""Commands on the run file that a case script leaves: look at it, check it, take it away.
+
+examples:
+  python cases/walker.py --preview --out out/walker    make a run
+  mpmopt plot out/walker/run.h5                        pictures of it
+  mpmopt film out/walker/run.h5                        and a film
+  mpmopt verify out/walker/run.h5                      are its gradients right?
+  mpmopt audit out/walker/run.h5                       does its design keep its gain?
+
+mpmopt COMMAND --help tells more. "python -m mpmopt" is the same as "mpmopt".
+
+exit codes:
+  0 all is well; 1 a check failed, or an error that standard error explains;
+  2 the command line was not understood; 130 interrupted, 143 terminated
+"""
 
 from __future__ import annotations
 
 import argparse
+import logging
 import sys
 from pathlib import Path
 
+from mpmopt import __version__
 from mpmopt.errors import MpmoptError
+from mpmopt.interrupt import Interrupted, interruptible
+
+
+def plot(path: Path, out: Path | None) -> int:
+    """Write pictures of a run: its scene, its bodies in motion, its history."""
+    from mpmopt import runfile
+    from mpmopt.files import make_folder
+    from mpmopt.plot import PICTURES, plot_run
+    from mpmopt.progress import Progress
+
+    run = runfile.read(path)
+    folder = out or path.parent
+    make_folder(folder)
+    with Progress("pictures", PICTURES) as progress:
+
+        def written(picture: Path) -> None:
+            progress.step(picture.name)
+            progress.print(str(picture))
+
+        plot_run(folder, run, written)
+    return 0
+
+
+def film(path: Path, out: Path | None, mp4: bool, seconds: float | None) -> int:
+    """Write a film of a run's design, the same without grey, and the full block."""
+    from mpmopt import runfile
+    from mpmopt.files import make_folder
+    from mpmopt.film import film as filmed
+
+    run = runfile.read(path)
+    target = out or path.parent / ("film.mp4" if mp4 else "film.gif")
+    make_folder(target.parent)
+    print(f"{target}: {filmed(target, run, seconds)}")
+    return 0
 
 
 def verify(path: Path) -> int:
     """Print the checks of a run's gradients; 1 if any failed."""
     from mpmopt import runfile
-    from mpmopt.verify import report
+    from mpmopt.progress import Progress
+    from mpmopt.verify import Check, report
 
     run = runfile.read(path)
-    checks = report(run.problem(), run.best)
-    width = max(len(check.name) for check in checks)
-    for check in checks:
-        mark = "ok" if check.passed else "FAILED"
-        print(f"{check.name:<{width}}  {check.value:12.3g}  {check.wanted:<10}  {mark}")
+    with Progress("checks") as progress:
+
+        def show(check: Check) -> None:
+            mark = "ok" if check.passed else "FAILED"
+            progress.step(check.name)
+            progress.print(f"{check.name:<34}  {check.value:12.3g}  {check.wanted:<10}  {mark}")
+
+        checks = report(run.problem(), run.best, progress=show)
     failed = sum(not check.passed for check in checks)
     print(f"{len(checks) - failed} of {len(checks)} checks passed")
     return 1 if failed else 0
@@ -56,41 +110,56 @@ def audit(path: Path) -> int:
     import numpy as np
 
     from mpmopt import runfile
+    from mpmopt.audit import VARIANTS, Audited
     from mpmopt.audit import audit as audited
+    from mpmopt.progress import Progress
 
     run = runfile.read(path)
-    print(
-        f"{'post-processed design':<21}  {'cells':>9}  {'step':>8}  full block  design  gain kept"
-    )
-    for row in audited(run.problem(), run.best):
-        cells = f"{row.cells[0]} x {row.cells[1]}"
-        if row.failure:
-            print(f"{row.name:<21}  no value: {row.failure}")
-            continue
-        kept = "" if np.isnan(row.kept) else f"{row.kept:9.0%}"
-        print(
-            f"{row.name:<21}  {cells:>9}  {row.time_step:8.2g}  {row.reference:10.4f}  "
-            f"{row.distance:6.4f}  {kept}"
+    with Progress("simulations", VARIANTS) as progress:
+
+        def show(row: Audited) -> None:
+            progress.step(row.name)
+            if row.failure:
+                progress.print(f"{row.name:<21}  no value: {row.failure}")
+                return
+            cells = f"{row.cells[0]} x {row.cells[1]}"
+            kept = "" if np.isnan(row.kept) else f"{row.kept:9.0%}"
+            progress.print(
+                f"{row.name:<21}  {cells:>9}  {row.time_step:8.2g}  {row.reference:10.4f}  "
+                f"{row.distance:6.4f}  {kept}"
+            )
+
+        progress.print(
+            f"{'post-processed design':<21}  {'cells':>9}  {'step':>8}  full block  design  "
+            "gain kept"
         )
+        audited(run.problem(), run.best, progress=show)
     return 0
 
 
 def cheapest(path: Path, tolerance: float, gradient_tolerance: float | None, seconds: float) -> int:
     """Print the cheapest discretisation that tells a run's best design as well as the finest."""
     from mpmopt import discretisation, runfile
+    from mpmopt.progress import Progress
 
     run = runfile.read(path)
     problem = run.problem()
-    found = discretisation.cheapest(
-        problem.scene,
-        run.best,
-        tolerance,
-        beta=problem.chain.beta,
-        leave_out=problem.leave_out,
-        gradient_tolerance=gradient_tolerance,
-        seconds=seconds,
-        progress=lambda line: print(line, flush=True),
-    )
+    with Progress("discretisations") as progress:
+
+        def show(line: discretisation.Evidence) -> None:
+            progress.step(str(line.measured.discretisation))
+            progress.print(str(line))
+
+        found = discretisation.cheapest(
+            problem.scene,
+            run.best,
+            tolerance,
+            beta=problem.chain.beta,
+            leave_out=problem.leave_out,
+            gradient_tolerance=gradient_tolerance,
+            seconds=seconds,
+            progress=show,
+        )
     print(f"reference                {found.reference.discretisation}")
     print(
         f"its own uncertainty      travel {found.objective_uncertainty:.1%}, "
@@ -108,28 +177,115 @@ def resume(path: Path) -> int:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run a command; 0 if all is well, 1 if not, 2 if it was not understood."""
-    parser = argparse.ArgumentParser(prog="python -m mpmopt", description=__doc__)
-    commands = parser.add_subparsers(required=True)
-    command = commands.add_parser("resume", help="go on with a run that was stopped")
-    command.add_argument("path", type=Path, metavar="RUN.h5")
+    """Run a command; the exit code is one of those in the module's text."""
+    arguments = _parser().parse_args(argv)
+    logging.basicConfig(format="%(message)s")
+    try:
+        with interruptible("Files are complete or absent."):
+            return int(arguments.do(arguments))
+    except MpmoptError as error:
+        print(f"{type(error).__name__}: {error}", file=sys.stderr)
+        return 1
+    except Interrupted as interrupted:
+        print(f"\n{interrupted}.", file=sys.stderr)
+        return interrupted.code
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="mpmopt", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--version", action="version", version=f"mpmopt {__version__}")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND", title="commands")
+
+    def add(name: str, text: str, description: str, *examples: str) -> argparse.ArgumentParser:
+        command = commands.add_parser(
+            name,
+            help=text,
+            description=description,
+            epilog="\n  ".join(["examples:", *(f"mpmopt {name} {line}" for line in examples)]),
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+        command.add_argument("path", type=Path, metavar="RUN.h5", help="run file of a case")
+        return command
+
+    command = add(
+        "resume",
+        "go on with it after a stop",
+        "Go on with an unfinished run to the end that it would have had without a stop.",
+        "out/walker/run.h5",
+    )
     command.set_defaults(do=lambda arguments: resume(arguments.path))
-    command = commands.add_parser("verify", help="check the gradients of a run's best design")
-    command.add_argument("path", type=Path, metavar="RUN.h5")
+
+    command = add(
+        "plot",
+        "draw its scene, its designs in motion and its history",
+        "Write schematic.png, history.png and, in motion, design.png (as it was optimised),\n"
+        "post_processed.png (without grey) and reference.png (the full block).",
+        "out/walker/run.h5",
+        "out/walker/run.h5 --out pictures",
+    )
+    command.add_argument("--out", type=Path, metavar="DIR", help="folder (default: the run's)")
+    command.set_defaults(do=lambda arguments: plot(arguments.path, arguments.out))
+
+    command = add(
+        "film",
+        "film its design beside the reference",
+        "Write a film of the best design, the same without grey, and the full block with the same\n"
+        "actuation, in slow motion. GIF needs nothing more; MP4 needs pip install 'mpmopt[film]'.",
+        "out/walker/run.h5",
+        "out/walker/run.h5 --mp4",
+        "out/walker/run.h5 --seconds 12 --out walker.gif",
+    )
+    command.add_argument("--mp4", action="store_true", help="film.mp4 instead of film.gif")
+    command.add_argument(
+        "--out", type=Path, metavar="FILE", help="ends in .gif or .mp4 (default: film.gif there)"
+    )
+    command.add_argument(
+        "--seconds", type=float, help="that it plays (default: so that each period is seen)"
+    )
+    command.set_defaults(
+        do=lambda arguments: film(arguments.path, arguments.out, arguments.mp4, arguments.seconds)
+    )
+
+    command = add(
+        "verify",
+        "check the gradients of its best design",
+        "Put the gradient before three independent witnesses: dot products, the complex step, and\n"
+        "the order of Taylor's remainder. Exits with 1 if any check fails.",
+        "out/walker/run.h5",
+    )
     command.set_defaults(do=lambda arguments: verify(arguments.path))
-    command = commands.add_parser("postprocess", help="remove the void of a run's best design")
-    command.add_argument("path", type=Path, metavar="RUN.h5")
+
+    command = add(
+        "postprocess",
+        "remove the void of its best design",
+        "Say how far the best design goes once its particles are solid or absent.",
+        "out/walker/run.h5",
+        "out/walker/run.h5 --threshold 0.5",
+    )
     command.add_argument(
         "--threshold", type=float, default=0.3, help="gamma from which a particle stays (0.3)"
     )
     command.set_defaults(do=lambda arguments: postprocess(arguments.path, arguments.threshold))
-    command = commands.add_parser("audit", help="simulate a run's best design more finely")
-    command.add_argument("path", type=Path, metavar="RUN.h5")
-    command.set_defaults(do=lambda arguments: audit(arguments.path))
-    command = commands.add_parser(
-        "cheapest", help="find the cheapest discretisation that is accurate enough"
+
+    command = add(
+        "audit",
+        "simulate its best design more finely",
+        "Say how much of its gain the best design, without void, keeps with half the step, twice\n"
+        "the step, and cells half as wide. Numerical propulsion keeps little.",
+        "out/walker/run.h5",
     )
-    command.add_argument("path", type=Path, metavar="RUN.h5")
+    command.set_defaults(do=lambda arguments: audit(arguments.path))
+
+    command = add(
+        "cheapest",
+        "find the cheapest discretisation that is accurate enough",
+        "Measure the best design in one discretisation after the other, from the cheapest on,\n"
+        "until travel and gradient agree with the finest that is affordable.",
+        "out/walker/run.h5 --tol 0.1",
+        "out/walker/run.h5 --tol 0.05 --gradient-tol inf --seconds 300",
+    )
     command.add_argument(
         "--tol", type=float, default=0.05, help="relative tolerance of travel and gradient (0.05)"
     )
@@ -144,12 +300,7 @@ def main(argv: list[str] | None = None) -> int:
             arguments.path, arguments.tol, arguments.gradient_tol, arguments.seconds
         )
     )
-    arguments = parser.parse_args(argv)
-    try:
-        return int(arguments.do(arguments))
-    except MpmoptError as error:
-        print(f"{type(error).__name__}: {error}", file=sys.stderr)
-        return 1
+    return parser
 
 
 if __name__ == "__main__":

@@ -14,6 +14,8 @@ from mpmopt.particles import lay_out, nearest_designed
 from mpmopt.problem import Problem
 from mpmopt.scene import Grid, Scene
 
+VARIANTS = 4  # discretisations that `audit` tries
+
 
 @dataclass(frozen=True)
 class Audited:
@@ -73,7 +75,11 @@ def _laid_out(scene: Scene, problem: Problem, x: NDArray[np.float64]) -> NDArray
     return solid[nearest_designed(lay_out(scene), problem.particles)]
 
 
-def audit(problem: Problem, x: NDArray[np.float64]) -> list[Audited]:
+def audit(
+    problem: Problem,
+    x: NDArray[np.float64],
+    progress: Callable[[Audited], None] | None = None,
+) -> list[Audited]:
     """Simulate a design without its void again with other steps and cells.
 
     A robot is the same at every discretisation: particles that gamma >= 0.3 makes solid stay, those
@@ -85,6 +91,8 @@ def audit(problem: Problem, x: NDArray[np.float64]) -> list[Audited]:
         In the discretisation that the design is from.
     x : (n,) array
         Its variables.
+    progress : callable, optional
+        Called with each line of the result.
 
     Returns
     -------
@@ -119,4 +127,6 @@ def audit(problem: Problem, x: NDArray[np.float64]) -> list[Audited]:
             rows.append(replace(row, kept=kept))
         except (SceneError, SimulationError) as error:
             rows.append(Audited(name, there.grid.cells, there.time_step, failure=str(error)))
+        if progress is not None:
+            progress(rows[-1])
     return rows

@@ -9,24 +9,23 @@ import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryFile
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from mpmopt import runfile
 from mpmopt.audit import audit
 from mpmopt.binary import THRESHOLD, Drawing, farthest, full_block, pieces, post_processed
 from mpmopt.checkpoints import Checkpointing
 from mpmopt.errors import MpmoptError, SimulationError, StorageError
-from mpmopt.files import locked, replace_file
+from mpmopt.files import locked, make_folder, replace_file
 from mpmopt.history import Optimisation
 from mpmopt.interrupt import Interrupted, interruptible
 from mpmopt.optimize import Settings, Stage, begin, go_on
 from mpmopt.particles import lay_out
 from mpmopt.problem import Problem, Variables
+from mpmopt.progress import Progress
 from mpmopt.scene import Scene
 
 logger = logging.getLogger(__name__)
@@ -109,19 +108,17 @@ class ProgressBar:
     """Callback of `optimise` that shows objective, beta and greyness; log lines off a terminal."""
 
     def __init__(self) -> None:
-        self._bar = tqdm(unit=" gradients", disable=not sys.stderr.isatty())
+        self._progress = Progress("gradients")
 
     def __call__(self, run: Optimisation) -> None:
-        last = run.history[-1]
-        self._bar.n = len(run.history) - 1
+        self._progress.count = len(run.history) - 1
         if run.stop_reason:
-            self._bar.close()
+            self._progress.close()
             return
-        text = f"L {last.objective:.4f}, beta {last.beta:g}, greyness {last.greyness:.3f}"
-        self._bar.set_postfix_str(text, refresh=False)
-        self._bar.update()
-        if self._bar.disable and len(run.history) % 10 == 0:
-            print(f"{len(run.history)} gradients, {last.seconds:.0f} s: {text}", file=sys.stderr)
+        last = run.history[-1]
+        self._progress.step(
+            f"L {last.objective:.4f}, beta {last.beta:g}, greyness {last.greyness:.3f}"
+        )
 
 
 def run(
@@ -156,12 +153,7 @@ def run(
         As `optimise` does.
     """
     path = out / "run.h5"
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        with TemporaryFile(dir=out):
-            pass
-    except OSError as error:
-        raise StorageError(f"cannot write to {out}: {error}; choose another folder") from error
+    make_folder(out)
     with locked(path):
         if path.exists() and not force:
             kept = runfile.read(path)
@@ -234,7 +226,7 @@ def _go_on(
     summary = summarise(result, kept.drawing)
     text = json.dumps(summary, indent=1) + "\n"
     replace_file(path.parent / "summary.json", text.encode())
-    _draw(path.parent, result, summary)
+    _draw(path.parent, result)
     runfile.write(path, result, summary, kept.drawing)
     return summary
 
@@ -295,11 +287,11 @@ def _number_or_none(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
-def _draw(out: Path, result: Optimisation, summary: Mapping[str, Any]) -> None:
+def _draw(out: Path, result: Optimisation) -> None:
     from mpmopt import plot
+    from mpmopt.motion import optimised
 
-    title = f"Optimised design, L = {summary['optimised']:.3f}"
-    plot.plot_design(out / "design.png", result.problem(), result.result.x, title)
+    plot.plot_motion(out / "design.png", optimised(result.problem(), result.result.x))
     plot.plot_history(out / "history.png", result)
 
 

@@ -51,3 +51,7 @@ class StorageError(MpmoptError, OSError):
 
 class RunFileError(MpmoptError, ValueError):
     """A file that is not a run file of this package, or a damaged one."""
+
+
+class MissingLibraryError(MpmoptError, ImportError):
+    """An optional library that something needs and that is not installed."""

@@ -47,6 +47,22 @@ def replace_file(path: Path, content: bytes) -> None:
             new.unlink(missing_ok=True)
 
 
+def make_folder(folder: Path) -> None:
+    """Make a folder, if it is not there, and see that files can be written to it.
+
+    Raises
+    ------
+    StorageError
+        If not.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise StorageError(f"cannot write to {folder}: {error}; choose another folder") from error
+
+
 def _unfinished(path: Path) -> str:
     return f".{path.name}-"
 

@@ -166,7 +166,7 @@ class StageState:
     mma: Mapping[str, Any]
 
 
-@dataclass
+@dataclass(repr=False)
 class Optimisation:
     """An optimisation as it stands: what `optimise` hands to callbacks and returns.
 
@@ -229,6 +229,27 @@ class Optimisation:
         """The problem that `result` solves, in the time step that it was evaluated with."""
         best = self.result
         return self.settings.stages[best.stage].problem(self.scene, best.time_step)
+
+    def __repr__(self) -> str:
+        found, stages = "no design yet", self.settings.stages
+        if self.best:
+            best = self.result
+            found = (
+                f"best L = {best.objective:.4f} at stage {best.stage + 1} of {len(stages)}, "
+                f"beta {best.beta:g}"
+            )
+        return (
+            f"Run of {len(self.history)} evaluations, {self.failed_evaluations} failed: {found}. "
+            f"{self.stop_reason or 'Not finished.'}"
+        )
+
+    def _repr_png_(self) -> bytes | None:
+        """A picture for notebooks, once there is a design."""
+        if not self.best:
+            return None
+        from mpmopt import draw, plot
+
+        return draw.png(plot.overview(self), dpi=80)
 
     @property
     def failed_evaluations(self) -> int:

@@ -44,7 +44,7 @@ WHOLE = tuple(f.name for f in dataclasses.fields(Iteration) if f.type == "int")
 COLUMNS = tuple(f.name for f in dataclasses.fields(Iteration) if f.type in ("int", "float"))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class RunFile:
     """What a run file holds.
 
@@ -118,8 +118,18 @@ class RunFile:
         """
         if not self.run.best or (stage is not None and stage not in self.run.best):
             where = "" if stage is None else f" of stage {stage}"
-            raise RunFileError(f"the run file holds no design{where}: no evaluation succeeded yet")
+            failures = [item.failure for item in self.run.history if item.failure]
+            last = f"; the last one failed: {failures[-1]}" if failures else ""
+            raise RunFileError(
+                f"the run file holds no design{where}: no evaluation succeeded yet{last}"
+            )
         return self.run.result if stage is None else self.run.best[stage]
+
+    def __repr__(self) -> str:
+        return repr(self.run)
+
+    def _repr_png_(self) -> bytes | None:
+        return self.run._repr_png_()
 
 
 def write(

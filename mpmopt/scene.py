@@ -356,6 +356,32 @@ class Scene(_Checked):
         self._check_mirror()
         self._check_stability()
 
+    def __str__(self) -> str:
+        nx, ny = self.grid.cells
+        kinds = [region.kind for region in self.body]
+        body = ", ".join(f"{kinds.count(kind)} {kind}" for kind in dict.fromkeys(kinds))
+        walls = ", ".join(
+            f"{wall.axis} {'>' if wall.solid_side == 'below' else '<'} {wall.position:g} "
+            f"({'stick' if wall.friction == 'stick' else f'friction {wall.friction:g}'})"
+            for wall in self.walls
+        )
+        mirror = ""
+        if self.mirror is not None:
+            mirror = f", symmetric about {self.mirror.axis} = {self.mirror.position:g}"
+        (gx, gy), (ex, ey) = self.gravity, self.direction
+        return (
+            f"Scene of {nx} x {ny} cells {self.grid.dx:g} wide, {self.steps} steps of "
+            f"{self.time_step:g}: a body of regions {body}{mirror}; "
+            f"free where {walls or 'the grid is'}; gravity ({gx:g}, {gy:g}); to travel along "
+            f"({ex:g}, {ey:g})"
+        )
+
+    def _repr_png_(self) -> bytes:
+        """A picture for notebooks."""
+        from mpmopt import draw, schematic
+
+        return draw.png(schematic.schematic(self), dpi=80)
+
     def _check_body(self) -> None:
         if not any(not isinstance(region, Design) for region in self.body):
             raise SceneError(

@@ -11,7 +11,7 @@ them beyond the gradient must fall with the square of the step.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -435,6 +435,12 @@ def complex_step_test(
     dict of str to ComplexStep
         By the name of the direction.
     """
+    return dict(_complex_steps(problem, x, directions, seed))
+
+
+def _complex_steps(
+    problem: Problem, x: NDArray[np.float64], directions: int, seed: int
+) -> Iterator[tuple[str, ComplexStep]]:
     rng = np.random.default_rng(seed)
     _, gradient = problem.value_and_gradient(x)
     moved = np.clip(x + 4.0 * np.spacing(x) * rng.choice([-1.0, 1.0], x.size), -1.0, 1.0)
@@ -450,14 +456,11 @@ def complex_step_test(
             d = np.zeros(x.size)
             d[index] = 1.0
             vectors[f"{name} of actuator {k}"] = d
-    result = {}
     for name, d in vectors.items():
         exact = problem.value(x + 1j * COMPLEX_STEP * d).imag / COMPLEX_STEP
         scale = abs(exact) or 1.0
-        result[name] = ComplexStep(
-            float(abs(exact - gradient @ d) / scale), float(change * np.linalg.norm(d) / scale)
-        )
-    return result
+        error, noise = abs(exact - gradient @ d) / scale, change * np.linalg.norm(d) / scale
+        yield name, ComplexStep(float(error), float(noise))
 
 
 class Taylor(NamedTuple):
@@ -524,7 +527,12 @@ class Check(NamedTuple):
     passed: bool
 
 
-def report(problem: Problem, x: NDArray[np.float64], seed: int = 0) -> list[Check]:
+def report(
+    problem: Problem,
+    x: NDArray[np.float64],
+    seed: int = 0,
+    progress: Callable[[Check], None] | None = None,
+) -> list[Check]:
     """All three tests on a design: each kernel, the whole gradient, and the Taylor order.
 
     Parameters
@@ -534,25 +542,33 @@ def report(problem: Problem, x: NDArray[np.float64], seed: int = 0) -> list[Chec
         Design variables. The Taylor test, which needs room on both sides, starts from x / 2 with
         the projection at beta = 1.
     seed : int, optional
+    progress : callable, optional
+        Called with each check once it is made.
     """
-    checks = [
-        Check(f"dot product: {name}", error, f"<= {DOT_TOLERANCE:g}", error <= DOT_TOLERANCE)
-        for name, error in kernel_mismatches(problem.scene, seed).items()
-    ]
-    for name, (error, noise) in complex_step_test(problem, x, seed=seed).items():
+    checks = []
+    for check in _checks(problem, x, seed):
+        checks.append(check)
+        if progress is not None:
+            progress(check)
+    return checks
+
+
+def _checks(problem: Problem, x: NDArray[np.float64], seed: int) -> Iterator[Check]:
+    for name, error in kernel_mismatches(problem.scene, seed).items():
+        wanted = f"<= {DOT_TOLERANCE:g}"
+        yield Check(f"dot product: {name}", error, wanted, error <= DOT_TOLERANCE)
+    for name, (error, noise) in _complex_steps(problem, x, 2, seed):
         tolerance = max(COMPLEX_TOLERANCE, noise)
         wanted = f"<= {tolerance:.2g}" + (" (rounding)" if noise > COMPLEX_TOLERANCE else "")
-        checks.append(Check(f"complex step: {name}", error, wanted, error <= tolerance))
+        yield Check(f"complex step: {name}", error, wanted, error <= tolerance)
     free = Problem(contact_free(problem.scene), checkpointing=problem.checkpointing, redo=0)
     direction = np.random.default_rng(seed).uniform(-1.0, 1.0, x.size)
     taylor = taylor_test(free, x / 2.0, direction)
     if taylor.remainder.max() <= REMAINDER_ROUNDING:  # nothing moves
         largest = float(taylor.remainder.max())
-        wanted = f"<= {REMAINDER_ROUNDING:g}"
-        return [*checks, Check("Taylor remainder, contact-free", largest, wanted, True)]
+        yield Check("Taylor remainder, contact-free", largest, f"<= {REMAINDER_ROUNDING:g}", True)
+        return
     for order in taylor.order:
         passed = bool(abs(order - 2.0) <= ORDER_TOLERANCE)
-        checks.append(
-            Check("Taylor order, contact-free", float(order), f"2 +- {ORDER_TOLERANCE:g}", passed)
-        )
-    return checks
+        wanted = f"2 +- {ORDER_TOLERANCE:g}"
+        yield Check("Taylor order, contact-free", float(order), wanted, passed)

@@ -5,6 +5,9 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
+from mpmopt import runfile
+from mpmopt.optimize import Settings, Stage, begin, optimise
+from mpmopt.problem import Problem
 from mpmopt.scene import Actuator, Design, Grid, Material, Scene, Solid, Wall
 
 
@@ -47,3 +50,27 @@ def worst(test) -> float:
 @pytest.fixture
 def scene() -> Scene:
     return small_scene()
+
+
+SHORT = Settings(
+    (Stage(4.0, 1e-2, 1e-3, 4e-3, solid=True),), window=1, least_iterations=2, most_iterations=2
+)
+
+
+@pytest.fixture(scope="session")
+def short_path(tmp_path_factory):
+    """The run file of two evaluations of the small scene."""
+    scene = small_scene()
+    path = tmp_path_factory.mktemp("short") / "run.h5"
+    runfile.write(path, optimise(scene, SHORT, Problem(scene).join(0.3, 1.0, -0.3, -0.5)))
+    return path
+
+
+@pytest.fixture(scope="session")
+def short_run(short_path):
+    return runfile.read(short_path)
+
+
+def empty(scene: Scene):
+    """A run of a scene before its first evaluation."""
+    return begin(scene, SHORT, [Problem(scene).join(0.3, 1.0, -0.3, -0.5)])

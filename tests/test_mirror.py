@@ -8,8 +8,8 @@ from conftest import small_scene, worst
 from crawler import crawler
 
 from mpmopt.errors import SceneError
+from mpmopt.motion import with_image
 from mpmopt.particles import lay_out, mirror_images
-from mpmopt.plot import with_image
 from mpmopt.problem import Problem
 from mpmopt.scene import Actuator, Design, Mirror, Scene, Solid, Wall
 from mpmopt.verify import COMPLEX_TOLERANCE, complex_step_test, kernel_mismatches

@@ -1,0 +1,153 @@
+"""Bodies at several instants, as pictures and films show them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpmopt.binary import THRESHOLD, full_block, solid_body
+from mpmopt.objective import Objective
+from mpmopt.problem import Problem
+from mpmopt.scene import Mirror, Scene
+from mpmopt.simulate import Simulation
+
+# Particles with less gamma than this are void: they do not count where a body is looked for.
+SEEN = 0.1
+
+
+def with_image(state: NDArray[np.float64], mirror: Mirror) -> NDArray[np.float64]:
+    """A state (12, N) and its mirror image (12, 2 N)."""
+    image = state.copy()
+    k, other = mirror.normal, 1 - mirror.normal
+    image[k] = 2.0 * mirror.position - state[k]
+    image[2 + k] *= -1.0
+    for block in (4, 8):  # C and F: one reflection from each side
+        image[block + 2 * k + other] *= -1.0
+        image[block + 2 * other + k] *= -1.0
+    return np.concatenate([state, image], axis=1)
+
+
+@dataclass(frozen=True)
+class Body:
+    """What is simulated, and how it looks.
+
+    Attributes
+    ----------
+    name : str
+    simulation : Simulation
+        Of N particles.
+    gamma : (N,) array
+        Their material density.
+    """
+
+    name: str
+    simulation: Simulation
+    gamma: NDArray[np.float64]
+
+
+def optimised(problem: Problem, x: NDArray[np.float64]) -> Body:
+    """A design as it was optimised, with its void."""
+    gamma = np.ones(len(problem.particles.position))
+    gamma[problem.particles.designed] = problem.gamma(x)
+    present = problem.present(problem.split(x).phi)
+    return Body("optimised design", problem.simulation(x), gamma[present])
+
+
+def post_processed(problem: Problem, x: NDArray[np.float64]) -> Body:
+    """A design without grey: what has gamma >= 0.3 is solid, the rest is removed."""
+    keep = problem.gamma(x) >= THRESHOLD
+    return _solid("post-processed design", problem, x, keep)
+
+
+def reference(problem: Problem, x: NDArray[np.float64]) -> Body:
+    """The reference design, a full block, with the actuation of a design."""
+    keep = full_block(problem.particles.position[problem.particles.designed])
+    return _solid("full block, same actuation", problem, x, keep)
+
+
+def _solid(name: str, problem: Problem, x: NDArray[np.float64], keep: NDArray[np.bool_]) -> Body:
+    simulation, _ = solid_body(problem.scene, keep, problem.split(x))
+    return Body(name, simulation, np.ones(len(simulation.particles.position)))
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A body at F instants; of a scene with a mirror both halves: M particles.
+
+    Attributes
+    ----------
+    name : str
+    scene : Scene
+    frames : (F,) array of int
+        Steps that were made before each instant.
+    position : (F, 2, M) array
+    deformation : (F, 4, M) array
+        Deformation gradient, row by row.
+    gamma : (M,) array
+        Material density.
+    actuation : (F, M) array
+        Signal divided by the largest of all; zero outside actuators.
+    objective : (F,) array
+        L, as if the motion ended there.
+    """
+
+    name: str
+    scene: Scene
+    frames: NDArray[np.int64]
+    position: NDArray[np.float32]
+    deformation: NDArray[np.float32]
+    gamma: NDArray[np.float64]
+    actuation: NDArray[np.float32]
+    objective: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, body: Body, frames: Sequence[int] | NDArray[np.int64]) -> Motion:
+        """Simulate a body.
+
+        Raises
+        ------
+        DesignError, SimulationError
+            As `Simulation.run` does.
+        """
+        simulation, gamma = body.simulation, body.gamma
+        scene, frames = simulation.scene, np.asarray(frames)
+        states = simulation.run([int(frame) for frame in frames])
+        objective = Objective.of(simulation.particles, scene.direction)
+        actuator = simulation.particles.actuator
+        values = [float(objective.value(state)) for state in states]
+        if scene.mirror is not None:
+            states = np.array([with_image(state, scene.mirror) for state in states])
+            gamma, actuator = np.tile(gamma, 2), np.tile(actuator, 2)
+        signal = np.real(simulation.signal)[np.minimum(frames, scene.steps - 1)]
+        largest = np.abs(simulation.signal).max(initial=0.0) or 1.0
+        actuation = np.zeros((len(frames), len(gamma)), np.float32)
+        actuation[:, actuator >= 0] = signal[:, actuator[actuator >= 0]] / largest
+        return cls(
+            name=body.name,
+            scene=scene,
+            frames=frames,
+            position=states[:, 0:2].astype(np.float32),
+            deformation=states[:, 8:12].astype(np.float32),
+            gamma=gamma,
+            actuation=actuation,
+            objective=np.array(values),
+        )
+
+    @property
+    def spacing(self) -> float:
+        """Width of the undeformed square that a particle stands for."""
+        return self.scene.grid.dx / self.scene.particles_per_cell
+
+    @property
+    def box(self) -> NDArray[np.float64]:
+        """Lower and upper corner (2, 2) of where particles with material are at all instants."""
+        seen = self.position[:, :, self.gamma >= SEEN]
+        return np.array([seen.min(axis=(0, 2)), seen.max(axis=(0, 2))], dtype=float)
+
+
+def equal_steps(scene: Scene, count: int) -> NDArray[np.int64]:
+    """Numbers of steps (count,) at equal intervals from start to end."""
+    return np.rint(np.linspace(0, scene.steps, count)).astype(np.int64)

@@ -1,0 +1,103 @@
+"""The command line: what it says of itself is true."""
+
+import argparse
+import configparser
+import importlib
+import re
+import shlex
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from conftest import empty
+
+import mpmopt
+from mpmopt import __main__ as commands
+from mpmopt import runfile
+from mpmopt.interrupt import Interrupted
+
+ROOT = Path(__file__).parent.parent
+PARSER = commands._parser()
+SUBPARSERS = next(
+    action.choices for action in PARSER._actions if isinstance(action, argparse._SubParsersAction)
+)
+
+
+def command(*arguments):
+    """``python -m mpmopt`` as a process of its own."""
+    return subprocess.run(
+        [sys.executable, "-m", "mpmopt", *map(str, arguments)],
+        capture_output=True, text=True, timeout=120, cwd=ROOT,
+    )  # fmt: skip
+
+
+def examples(name):
+    """Arguments of the examples in a command's help."""
+    lines = re.findall(
+        r"^  mpmopt (.*)$", SUBPARSERS[name].format_help().split("examples:")[1], re.MULTILINE
+    )
+    return [shlex.split(line) for line in lines]
+
+
+def first_example(name, path):
+    """Its first example, on another run file."""
+    return [str(path) if part == "out/walker/run.h5" else part for part in examples(name)[0]]
+
+
+@pytest.mark.parametrize("name", SUBPARSERS)
+def test_the_examples_of_each_command_are_understood(name):
+    assert examples(name)
+    for example in examples(name):
+        assert example[0] == name
+        assert "out/walker/run.h5" in example
+        assert callable(PARSER.parse_args(example).do)
+
+
+def test_the_help_lists_every_command_and_its_examples_are_understood():
+    help_text = PARSER.format_help()
+    for name in SUBPARSERS:
+        assert re.search(rf"^    {name}\b", help_text, re.MULTILINE)
+    shown = re.findall(r"^  mpmopt ([a-z]+ \S+)", help_text, re.MULTILINE)
+    assert len(shown) >= 3
+    for example in shown:
+        PARSER.parse_args(example.split())
+
+
+def test_the_installed_command_is_this_one():
+    settings = configparser.ConfigParser()
+    settings.read(ROOT / "setup.cfg")
+    name, target = settings["options.entry_points"]["console_scripts"].strip().split(" = ")
+    module, function = target.split(":")
+    assert name == PARSER.prog
+    assert getattr(importlib.import_module(module), function) is commands.main
+
+
+def test_exit_codes_are_those_of_the_help(tmp_path, monkeypatch, capsys):
+    said = command("--version")
+    assert (said.returncode, said.stdout) == (0, f"mpmopt {mpmopt.__version__}\n")
+    for wrong in ([], ["fly"], ["plot"], ["film", "run.h5", "--seconds", "long"]):
+        with pytest.raises(SystemExit) as end:
+            commands.main(wrong)
+        assert end.value.code == 2
+    capsys.readouterr()
+    for name in SUBPARSERS:
+        assert commands.main(first_example(name, tmp_path / "run.h5")) == 1
+        assert capsys.readouterr().err.startswith("RunFileError: ")
+
+    def interrupted(path):
+        raise Interrupted(signal.SIGTERM)
+
+    monkeypatch.setattr(runfile, "read", interrupted)
+    assert commands.main(["verify", "run.h5"]) == 143
+    assert capsys.readouterr().err == "\nstopped by SIGTERM.\n"
+
+
+def test_each_command_refuses_a_run_without_a_design(short_run, tmp_path, capsys):
+    path = tmp_path / "run.h5"
+    runfile.write(path, empty(short_run.scene))
+    for name in SUBPARSERS.keys() - {"resume"}:
+        assert commands.main(first_example(name, path)) == 1
+        assert "no design: no evaluation succeeded yet" in capsys.readouterr().err
+    assert [file.name for file in tmp_path.iterdir()] == ["run.h5"]

@@ -1,0 +1,108 @@
+"""Bodies and walls are drawn where they are, as what they are."""
+
+import numpy as np
+import pytest
+from conftest import small_scene
+
+from mpmopt.draw import BLUE, RED, Squares, draw_walls, new_figure, set_view
+from mpmopt.motion import Motion, optimised, reference
+from mpmopt.problem import Problem
+from mpmopt.scene import Grid, Scene, Solid, Wall
+
+
+def drawn(motion, box, frame=0):
+    """A picture (height, width, 3) of a motion in a box, and a function from points to colours."""
+    figure = new_figure(4.0, 4.0 * (box[1][1] - box[0][1]) / (box[1][0] - box[0][0]))
+    figure.set_layout_engine("none")
+    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+    axes.set_axis_off()
+    set_view(axes, np.array(box))
+    axes.add_collection(Squares(motion, frame), autolim=False)
+    figure.canvas.draw()
+    picture = np.array(figure.canvas.buffer_rgba())[..., :3] / 255.0
+
+    def colour(points):
+        x, y = np.floor(axes.transData.transform(points)).astype(int).T
+        return picture[len(picture) - 1 - y, x]
+
+    return picture, colour
+
+
+def made_up(position, deformation, gamma, actuation):
+    """A motion of one instant from arrays with one row for each particle."""
+    count = len(gamma)
+    return Motion(
+        name="made up",
+        scene=small_scene(),
+        frames=np.array([0]),
+        position=np.array(position, np.float32).reshape(count, 2).T[None],
+        deformation=np.array(deformation, np.float32).reshape(count, 4).T[None],
+        gamma=np.array(gamma, float),
+        actuation=np.array(actuation, np.float32)[None],
+        objective=np.zeros(1),
+    )
+
+
+def test_a_particle_is_the_square_that_its_deformation_makes(rng):
+    position = np.array([(x, y) for x in (0.2, 0.4, 0.6) for y in (0.2, 0.4, 0.6)])
+    F = np.eye(2) + rng.uniform(-0.4, 0.4, (9, 2, 2))
+    motion = made_up(position, F, np.ones(9), np.zeros(9))
+    _, colour = drawn(motion, [(0.1, 0.1), (0.7, 0.7)])
+    corners = 0.5 * motion.spacing * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [1, 0], [0, 1]])
+    for centre, gradient in zip(position, F):
+        edge = corners @ gradient.T
+        assert np.all(colour(centre + 0.9 * edge) == 0.0)
+        assert np.all(colour(centre + 1.4 * edge) == 1.0)
+
+
+def test_grey_is_gamma_and_red_and_blue_are_the_sign_of_the_signal():
+    position = [(0.2 + 0.1 * k, 0.2) for k in range(6)]
+    gamma, actuation = [0.0, 0.5, 1.0, 1.0, 1.0, 1.0], [0.0, 0.0, 0.0, 1.0, -1.0, 0.5]
+    motion = made_up(position, np.tile(np.eye(2), (6, 1, 1)), gamma, actuation)
+    _, colour = drawn(motion, [(0.1, 0.1), (0.8, 0.3)])
+    wanted = [(1, 1, 1), (0.5, 0.5, 0.5), (0, 0, 0), RED, BLUE, 0.5 * np.array(RED)]
+    assert np.allclose(colour(position), wanted, atol=1 / 255)
+
+
+def test_solid_is_drawn_above_void():
+    motion = made_up([(0.2, 0.2), (0.2, 0.2)], 2 * [np.eye(2)], [1.0, 0.1], [0.0, 0.0])
+    _, colour = drawn(motion, [(0.1, 0.1), (0.3, 0.3)])
+    assert np.all(colour([(0.2, 0.2)]) == 0.0)
+
+
+def test_no_light_shows_between_the_particles_of_a_solid(rng):
+    scene = small_scene()
+    problem = Problem(scene)
+    body = reference(problem, problem.join(0.0, 0.0, 0.0, 0.0))
+    motion = Motion.of(body, [0])
+    box = motion.box
+    _, colour = drawn(motion, [(0.1, 0.2), (0.6, 0.5)])
+    assert np.all(colour(rng.uniform(*box, (2000, 2))) == 0.0)
+
+
+@pytest.mark.parametrize("place", [4.0, 4.4, 5.0])
+@pytest.mark.parametrize("side", ["below", "above"])
+@pytest.mark.parametrize("gravity", [2.0, 10.0])
+def test_walls_are_drawn_where_bodies_rest_on_them(place, side, gravity):
+    dx = 1 / 32
+    up = 1.0 if side == "below" else -1.0  # away from the wall
+
+    def height(cells):
+        return cells * dx if side == "below" else 1.0 - cells * dx
+
+    low, high = sorted([height(5), height(9)])
+    scene = Scene(
+        Grid((32, 32), dx), 2e-3, 1500, gravity=(0.0, -up * gravity),
+        walls=(Wall("y", height(place), side),),
+        body=(Solid((8 * dx, low), (16 * dx, high)),),
+    )  # fmt: skip
+    body = optimised(Problem(scene), np.empty(0))
+    motion = Motion.of(body, range(scene.steps // 2, scene.steps + 1, 10))
+    half = 0.5 * motion.spacing * motion.deformation[:, 3]
+    edge = up * (up * motion.position[:, 1] - half).min(axis=1).mean()
+    axes = new_figure(4.0, 4.0).add_subplot()
+    set_view(axes, np.array([(0.0, 0.0), (1.0, 1.0)]))
+    draw_walls(axes, scene, moving=True)
+    (wall,) = axes.patches
+    line = wall.get_y() + (wall.get_height() if side == "below" else 0.0)
+    assert abs(edge - line) <= 0.2 * dx

@@ -1,0 +1,215 @@
+"""Films: whole or absent, with the frames that were asked for, of bodies that move."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import empty, small_scene
+from PIL import Image
+from test_mirror import channel
+
+from mpmopt import film as films
+from mpmopt import runfile
+from mpmopt.__main__ import main
+from mpmopt.errors import DesignError, MissingLibraryError, RunFileError, StorageError
+from mpmopt.film import LAST, RATE, Screen, film, playing_time
+from mpmopt.interrupt import Interrupted
+from mpmopt.motion import Motion, equal_steps, optimised, post_processed, reference
+from mpmopt.problem import Problem
+
+ROOT = Path(__file__).parent.parent
+
+
+def motions(run, count):
+    problem, x = run.problem(), run.best
+    return [
+        Motion.of(body(problem, x), equal_steps(problem.scene, count))
+        for body in (optimised, post_processed, reference)
+    ]
+
+
+def gif(path):
+    """All frames of a GIF, and their durations in seconds."""
+    with Image.open(path) as image:
+        frames, durations = [], []
+        for number in range(image.n_frames):
+            image.seek(number)
+            frames.append(np.array(image.convert("RGB"), dtype=int))
+            durations.append(image.info["duration"] / 1000.0)
+    return np.array(frames), np.array(durations)
+
+
+def test_a_gif_has_the_frames_that_were_asked_for_and_they_are_the_screens(short_run, tmp_path):
+    told = film(tmp_path / "film.gif", short_run, seconds=1.0)
+    frames, durations = gif(tmp_path / "film.gif")
+    assert told.frames == len(frames) == RATE
+    assert durations[:-1] == pytest.approx(1.0 / RATE)
+    assert durations.sum() == pytest.approx(1.0 + LAST) == told.seconds
+    assert told.bytes == (tmp_path / "film.gif").stat().st_size
+    assert told.slow == pytest.approx(1.0 / short_run.scene.duration)
+    screen = Screen(motions(short_run, RATE), told.slow)
+    for number in (0, 7, RATE - 1):
+        difference = np.abs(frames[number] - screen.frame(number).astype(int))
+        assert difference.max() <= 64  # the palette, where red meets grey
+        assert difference.mean() <= 2.0
+
+
+def test_bodies_are_where_their_particles_are_and_move(short_run):
+    shown = motions(short_run, 5)
+    screen = Screen(shown, 1.0)
+    pictures = [screen.frame(number) for number in range(5)]
+    height = len(pictures[0])
+    for panel, motion in zip(screen.panels, shown):
+        problem, x = short_run.problem(), short_run.best
+        body = {"o": optimised, "p": post_processed, "f": reference}[motion.name[0]](problem, x)
+        solid = (body.gamma >= 0.9) & (body.simulation.particles.actuator < 0)
+        assert solid.sum() >= 4
+        for number, step in enumerate(motion.frames):
+            state = body.simulation.run([int(step)])[0]  # told without the motion
+            places = panel.transData.transform(state[0:2].T)
+            x, y = np.floor(places[solid]).astype(int).T
+            assert np.all(pictures[number][height - 1 - y, x] <= 60)
+            right = places[:, 0].max()
+            edge = panel.get_window_extent()
+            middle = height - 1 - int(places[:, 1].mean())
+            row = pictures[number][middle, int(right) + 14 : int(edge.x1) - 2]
+            assert row.size and np.all(row == 255)  # nothing ahead of the body
+        assert np.abs(np.diff([picture.astype(int) for picture in pictures], axis=0)).max() > 200
+
+
+def test_both_halves_of_a_symmetric_scene_are_shown():
+    scene = channel("y", steps=20)
+    problem = Problem(scene, 4.0)
+    x = problem.join(np.linspace(-1.0, 1.0, 24), 1.0, -0.3, -0.5)
+    body = optimised(problem, x)
+    motion = Motion.of(body, [0, 20])
+    assert len(motion.gamma) == 2 * len(body.gamma)
+    screen = Screen([motion], 1.0)
+    (panel,) = screen.panels
+    picture = screen.frame(1)[..., 0].astype(int)
+    axis = panel.transData.transform((0.0, scene.mirror.position))[1]
+    box = panel.get_window_extent()
+    above = [round(axis + 0.5 + k) for k in range(int(box.height / 2) - 3)]
+    below = [round(axis - 0.5 - k) for k in range(int(box.height / 2) - 3)]
+    columns = slice(int(box.x0) + 2, int(box.x1) - 2)
+    upper, lower = (picture[len(picture) - 1 - np.array(rows), columns] for rows in (above, below))
+    inside = slice(0, int(box.height / 2 * 0.5))  # hatches are not symmetric
+    assert (upper[inside] < 128).mean() >= 0.1
+    assert (abs(upper[inside] - lower[inside]) > 128).mean() <= 0.02
+
+
+def test_a_film_is_long_enough_to_see_each_period():
+    scene = small_scene(steps=400)  # 1.6, fastest actuator: 50
+    periods = 1.6 * 50.0 / (2.0 * np.pi)
+    assert playing_time(scene) == pytest.approx(1.25 * periods)
+    assert playing_time(small_scene(steps=1)) == 4.0
+    assert playing_time(small_scene(steps=4000)) == 20.0
+
+
+def test_too_few_frames_for_the_gait_are_told(short_run, tmp_path, caplog):
+    told = film(tmp_path / "film.gif", short_run, seconds=0.2)
+    assert told.frames == 5
+    assert told.per_period == pytest.approx(5 / (0.16 * 50.0 / (2.0 * np.pi)))
+    assert "frames per period" in caplog.text
+
+
+def test_mp4_has_the_frames_of_the_gif(short_run, tmp_path):
+    import imageio_ffmpeg
+
+    told = film(tmp_path / "film.mp4", short_run, seconds=0.4)
+    decoded = subprocess.run(
+        [imageio_ffmpeg.get_ffmpeg_exe(), "-i", tmp_path / "film.mp4", "-f", "rawvideo",
+         "-pix_fmt", "rgb24", "-"],
+        capture_output=True, check=True,
+    )  # fmt: skip
+    facts = decoded.stderr.decode()
+    assert "Video: h264" in facts and f"{RATE} fps" in facts
+    width, height = map(int, re.search(r", (\d+)x(\d+)[ ,]", facts).groups())
+    frames = np.frombuffer(decoded.stdout, np.uint8).reshape(-1, height, width, 3)
+    assert (told.frames, len(frames)) == (10, 10 + RATE)  # the last one stays for a second
+    screen = Screen(motions(short_run, 10), 0.4 / 0.16)
+    for number in (0, 5, 9):
+        assert np.abs(frames[number].astype(int) - screen.frame(number)).mean() <= 4.0
+
+
+def test_mp4_without_its_library_says_what_to_install(short_run, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    with pytest.raises(MissingLibraryError, match=r"pip install 'mpmopt\[film\]'"):
+        film(tmp_path / "film.mp4", short_run)
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_encoder_that_fails_leaves_nothing(short_run, tmp_path, monkeypatch):
+    monkeypatch.setattr(films, "_ffmpeg", lambda: "false")
+    with pytest.raises(StorageError, match="ffmpeg ended with 1"):
+        film(tmp_path / "film.mp4", short_run, seconds=0.4)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", ["film.avi", "film"])
+def test_another_ending_is_refused(short_run, tmp_path, name):
+    with pytest.raises(DesignError, match="ends in"):
+        film(tmp_path / name, short_run)
+
+
+@pytest.mark.parametrize("seconds", [0.0, -1.0, 0.05, float("nan"), float("inf"), 1e9])
+def test_a_length_that_makes_no_sense_is_refused(short_run, tmp_path, seconds):
+    with pytest.raises(DesignError, match="seconds"):
+        film(tmp_path / "film.gif", short_run, seconds)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("ending", ["gif", "mp4"])
+def test_an_interrupt_leaves_an_older_film_as_it_was(short_path, tmp_path, monkeypatch, ending):
+    target = tmp_path / f"film.{ending}"
+    target.write_text("an older film")
+    frame = Screen.frame
+
+    def interrupted(self, number):
+        if number == 3:
+            raise Interrupted(signal.SIGINT)
+        return frame(self, number)
+
+    monkeypatch.setattr(Screen, "frame", interrupted)
+    assert main(["film", str(short_path), "--seconds", "0.4", "--out", str(target)]) == 130
+    assert [file.name for file in tmp_path.iterdir()] == [target.name]
+    assert target.read_text() == "an older film"
+
+
+def test_the_command_says_what_it_made(short_path, tmp_path, capsys):
+    target = tmp_path / "new" / "walker.gif"
+    assert main(["film", str(short_path), "--seconds", "0.4", "--out", str(target)]) == 0
+    printed = capsys.readouterr()
+    assert printed.out.startswith(f"{target}: 10 frames, 1.4 s, 2.5 times slower")
+    assert "10 of 10 frames" in printed.err
+    assert main(["film", str(short_path), "--out", str(tmp_path / "film.avi")]) == 1
+    assert capsys.readouterr().err.startswith("DesignError: ")
+
+
+def test_a_run_without_a_design_has_no_film(tmp_path):
+    scene = small_scene()
+    runfile.write(tmp_path / "run.h5", empty(scene))
+    with pytest.raises(RunFileError, match="no evaluation succeeded yet"):
+        film(tmp_path / "film.gif", runfile.read(tmp_path / "run.h5"))
+    assert main(["film", str(tmp_path / "run.h5")]) == 1
+    assert [file.name for file in tmp_path.iterdir()] == ["run.h5"]
+
+
+@pytest.mark.slow
+def test_an_interrupt_ends_a_long_film_at_once(short_path, tmp_path):
+    process = subprocess.Popen(
+        [sys.executable, "-m", "mpmopt", "film", short_path, "--seconds", "300",
+         "--out", tmp_path / "film.gif"],
+        stderr=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )  # fmt: skip
+    assert "of 7500 frames" in process.stderr.readline()
+    process.send_signal(signal.SIGINT)
+    _, said = process.communicate(timeout=30)
+    assert process.returncode == 130
+    assert said.splitlines()[-1] == "stopped by SIGINT."
+    assert not list(tmp_path.iterdir())

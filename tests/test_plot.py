@@ -1,0 +1,179 @@
+"""Pictures of a run from its file alone, whole or absent; what notebooks and terminals show."""
+
+import dataclasses
+from io import BytesIO
+
+import numpy as np
+import pytest
+from conftest import SHORT, empty, small_scene
+from PIL import Image
+from scipy.ndimage import binary_erosion, label
+from test_mirror import channel
+from walker import walker
+
+from mpmopt import draw, files, plot, runfile
+from mpmopt.__main__ import main
+from mpmopt.errors import RunFileError, SimulationError, StorageError
+from mpmopt.history import Iteration
+from mpmopt.optimize import optimise
+from mpmopt.problem import Problem
+from mpmopt.schematic import schematic
+
+NAMES = {"schematic.png", "history.png", "design.png", "post_processed.png", "reference.png"}
+
+
+def picture(content):
+    """The pixels of a PNG, all of which are read."""
+    with Image.open(BytesIO(content)) as image:
+        assert image.format == "PNG"
+        return np.array(image.convert("RGB"))
+
+
+def test_plot_draws_a_run_from_its_file(short_path, tmp_path, capsys):
+    folder = tmp_path / "new"
+    assert main(["plot", str(short_path), "--out", str(folder)]) == 0
+    assert {file.name for file in folder.iterdir()} == NAMES
+    for file in folder.iterdir():
+        pixels = picture(file.read_bytes())
+        assert min(pixels.shape[:2]) >= 200
+        assert (pixels < 128).all(axis=2).mean() >= 0.01  # not empty
+    for name in ("design", "post_processed", "reference"):
+        pixels = picture((folder / f"{name}.png").read_bytes()).astype(int)
+        bodies = binary_erosion(pixels.min(axis=2) < 100, iterations=5)  # no lines, no letters
+        assert label(bodies)[1] >= 8
+    printed = capsys.readouterr()
+    assert {line.split("/")[-1] for line in printed.out.splitlines()} == NAMES
+    assert "5 of 5 pictures" in printed.err
+
+
+def test_a_history_is_the_same_from_a_run_and_from_its_file(tmp_path):
+    scene = small_scene(steps=10)
+    run = optimise(scene, SHORT, Problem(scene).join(0.0, 1.0, -0.3, -0.5))
+    runfile.write(tmp_path / "run.h5", run)
+    plot.plot_history(tmp_path / "a.png", run)
+    plot.plot_history(tmp_path / "b.png", runfile.read(tmp_path / "run.h5").run)
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+
+
+def run_of(**columns):
+    """A run with this history and no design."""
+    names = [field.name for field in dataclasses.fields(Iteration)]
+    count = len(columns["objective"])
+    default = {name: count * [0] for name in names} | {"post_processed": count * [np.nan]}
+    rows = zip(*({**default, **columns}[name] for name in names))
+    run = empty(small_scene())
+    run.history = [Iteration(**dict(zip(names, row))) for row in rows]
+    return run
+
+
+def test_a_history_marks_each_stage_and_failure_where_it_is():
+    axes = draw.new_figure(7, 4).add_subplot()
+    draw.draw_history(
+        axes,
+        run_of(
+            objective=[0.2, 0.3, np.nan, 0.4, 0.5, 0.6],
+            beta=[0.5, 0.5, 0.5, 1.0, 0.5, 0.5],
+            stage=[0, 0, 0, 1, 0, 0],
+            start=[0, 0, 0, 0, 1, 1],
+        ),
+    )
+    lines = {line.get_label(): line for line in axes.lines}
+    assert np.array_equal(lines["failed evaluation"].get_xdata(), [3])
+    assert np.array_equal(lines["objective L"].get_ydata()[:2], [0.2, 0.3])
+    marks = {text.xy[0]: text.get_text() for text in axes.texts}
+    assert marks == {0.5: r"$\beta$ = 0.5", 3.5: r"$\beta$ = 1", 4.5: r"$\beta$ = 0.5"}
+
+
+def test_a_history_of_failures_alone_can_be_drawn():
+    axes = draw.new_figure(7, 4).add_subplot()
+    draw.draw_history(axes, run_of(objective=[np.nan, np.nan]))
+    assert "failed evaluation" in {line.get_label() for line in axes.lines}
+
+
+def test_a_run_without_a_design_is_an_error_and_leaves_nothing(tmp_path, capsys):
+    runfile.write(tmp_path / "run.h5", empty(small_scene()))
+    assert main(["plot", str(tmp_path / "run.h5")]) == 1
+    assert capsys.readouterr().err.startswith("RunFileError: the run file holds no design")
+    assert [file.name for file in tmp_path.iterdir()] == ["run.h5"]
+
+
+def test_an_unfinished_run_is_drawn_without_what_fails(short_run, tmp_path, caplog, monkeypatch):
+    def fails(problem, x):
+        raise SimulationError("it burst", 3, -1, (np.nan, np.nan), "take another")
+
+    for body in ("optimised", "post_processed", "reference"):
+        monkeypatch.setattr(plot, body, fails)
+    unfinished = dataclasses.replace(short_run.run, stop_reason="")
+    plot.plot_run(tmp_path, dataclasses.replace(short_run, run=unfinished))
+    assert {file.name for file in tmp_path.iterdir()} == {"schematic.png", "history.png"}
+    assert "no reference.png: step 3, body: it burst" in caplog.text
+
+
+def test_a_folder_that_cannot_be_written_is_a_storage_error(short_run, tmp_path):
+    with pytest.raises(StorageError):
+        plot.plot_run(tmp_path / "nowhere", short_run)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(StorageError, match="choose another folder"):
+        files.make_folder(tmp_path / "file" / "folder")
+
+
+def words(figure):
+    (axes,) = figure.axes
+    return [text.get_text() for text in axes.texts]
+
+
+def test_a_schematic_tells_all_that_is_there():
+    shown = words(schematic(walker(64, 8e-4)))
+    assert sorted(word for word in shown if word.isalpha()) == [
+        "actuator", "design", "solid", "solid", "stick", "travel",
+    ]  # fmt: skip
+    assert "g = 10" in shown
+    # 20c x 10c: along x 5c, 10c, 5c; along y 7c, 3c; with c = 1/64
+    lengths = sorted(float(word) for word in shown if word.startswith("0."))
+    assert np.allclose(lengths, sorted(k / 64 for k in (20, 10, 5, 10, 5, 7, 3)), rtol=1e-5)
+
+
+def test_a_schematic_of_a_channel_shows_its_mirror_and_friction():
+    figure = schematic(channel("x"))
+    assert words(figure).count("friction 0.4") == 2
+    assert not any(word.startswith("g =") for word in words(figure))
+    (line,) = figure.axes[0].lines
+    assert np.array_equal(line.get_xdata(), [0.5, 0.5])
+
+
+def test_a_schematic_numbers_actuators_as_the_variables_are():
+    shown = words(schematic(small_scene()))
+    assert {"actuator 0", "actuator 1", "friction 0.3", "stick"} <= set(shown)
+
+
+def test_notebooks_show_pictures_and_terminals_a_sentence(short_run):
+    scene = small_scene()
+    assert picture(scene._repr_png_()).std() > 10
+    assert "16 x 16 cells 0.0625 wide, 40 steps of 0.004" in str(scene)
+    assert "1 design, 2 actuator, 1 solid" in str(scene)
+    assert "y > 0.25 (friction 0.3), x > 0.1875 (stick)" in str(scene)
+    assert picture(short_run._repr_png_()).std() > 10
+    assert repr(short_run) == str(short_run)
+    assert str(short_run).startswith("Run of 2 evaluations, 0 failed: best L = ")
+    assert "at stage 1 of 1, beta 4. Stage 1 of 1 was the last:" in str(short_run)
+
+
+def test_an_optimisation_shows_itself_as_its_file_does(tmp_path):
+    scene = small_scene(steps=10)
+    made = optimise(scene, SHORT, Problem(scene).join(0.0, 1.0, -0.3, -0.5))
+    runfile.write(tmp_path / "run.h5", made)
+    back = runfile.read(tmp_path / "run.h5")
+    assert repr(made) == repr(back)
+    assert made._repr_png_() == back._repr_png_()
+    none = empty(scene)
+    assert repr(none) == "Run of 0 evaluations, 0 failed: no design yet. Not finished."
+    assert none._repr_png_() is None
+    runfile.write(tmp_path / "run.h5", none)
+    assert runfile.read(tmp_path / "run.h5")._repr_png_() is None
+
+
+def test_a_run_that_failed_says_how():
+    run = run_of(objective=[0.2, np.nan], failure=["", "step 3: it burst"])
+    kept = runfile.RunFile(run, {})
+    with pytest.raises(RunFileError, match=r"no design: .* last one failed: step 3: it burst"):
+        _ = kept.best
