@@ -201,11 +201,11 @@ def film(path: Path, run: RunFile, seconds: float | None = None) -> Filmed:
         raise DesignError(f"film: seconds = {seconds!r} must be from {2 / RATE:g} to 600")
     instants = equal_steps(scene, count)
     motions = [Motion.of(optimised(problem, x), instants)]
-    for body in (post_processed(problem, x), reference(problem, x)):
+    for body in (post_processed, reference):
         try:
-            motions.append(Motion.of(body, instants))
+            motions.append(Motion.of(body(problem, x), instants))
         except SimulationError as error:
-            logger.warning("%s is not in the film: %s", body.name, error)
+            logger.warning("the film is without a body: %s", error)
     slow = seconds / scene.duration
     screen = Screen(motions, slow)
     with Progress("frames", screen.frames) as progress:

@@ -16,7 +16,13 @@ from test_mirror import channel
 from mpmopt import film as films
 from mpmopt import runfile
 from mpmopt.__main__ import main
-from mpmopt.errors import DesignError, MissingLibraryError, RunFileError, StorageError
+from mpmopt.errors import (
+    DesignError,
+    MissingLibraryError,
+    RunFileError,
+    SimulationError,
+    StorageError,
+)
 from mpmopt.film import LAST, RATE, Screen, film, playing_time
 from mpmopt.interrupt import Interrupted
 from mpmopt.motion import Motion, equal_steps, optimised, post_processed, reference
@@ -151,6 +157,23 @@ def test_an_encoder_that_fails_leaves_nothing(short_run, tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
+def bursts(problem, x):
+    raise SimulationError("it burst", 3, -1, (np.nan, np.nan), "take another")
+
+
+def test_a_body_that_cannot_be_simulated_is_left_out(short_run, tmp_path, monkeypatch, caplog):
+    film(tmp_path / "three.gif", short_run, seconds=0.4)
+    monkeypatch.setattr(films, "post_processed", bursts)
+    film(tmp_path / "two.gif", short_run, seconds=0.4)
+    assert "it burst" in caplog.text
+    three, two = (gif(tmp_path / f"{name}.gif")[0].shape for name in ("three", "two"))
+    assert 3 * two[2] == 2 * three[2]  # beside each other
+    monkeypatch.setattr(films, "optimised", bursts)
+    with pytest.raises(SimulationError, match="it burst"):
+        film(tmp_path / "none.gif", short_run, seconds=0.4)
+    assert {file.name for file in tmp_path.iterdir()} == {"three.gif", "two.gif"}
+
+
 @pytest.mark.parametrize("name", ["film.avi", "film"])
 def test_another_ending_is_refused(short_run, tmp_path, name):
     with pytest.raises(DesignError, match="ends in"):
@@ -203,11 +226,11 @@ def test_a_run_without_a_design_has_no_film(tmp_path):
 @pytest.mark.slow
 def test_an_interrupt_ends_a_long_film_at_once(short_path, tmp_path):
     process = subprocess.Popen(
-        [sys.executable, "-m", "mpmopt", "film", short_path, "--seconds", "300",
+        [sys.executable, "-m", "mpmopt", "film", short_path, "--seconds", "60",
          "--out", tmp_path / "film.gif"],
         stderr=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": str(ROOT)},
     )  # fmt: skip
-    assert "of 7500 frames" in process.stderr.readline()
+    assert "of 1500 frames" in process.stderr.readline()
     process.send_signal(signal.SIGINT)
     _, said = process.communicate(timeout=30)
     assert process.returncode == 130
