@@ -64,6 +64,22 @@ def test_grey_is_gamma_and_red_and_blue_are_the_sign_of_the_signal():
     assert np.allclose(colour(position), wanted, atol=1 / 255)
 
 
+def test_actuators_have_the_colour_of_their_signal_at_each_instant():
+    scene = small_scene()
+    problem = Problem(scene)
+    a, theta, b = np.array([0.6, 0.4]), np.array([-0.3, 0.2]), np.array([-0.2, 0.1])
+    body = reference(problem, problem.join(0.0, a, theta, b))
+    frames = np.array([0, 7, 20])
+    motion = Motion.of(body, frames)
+    steps = np.arange(scene.steps)[:, None] * scene.time_step
+    signal = a * np.sin(np.array([30.0, 50.0]) * steps + np.pi * theta) + b
+    for k in (0, 1):
+        there = body.simulation.particles.actuator == k
+        wanted = signal[frames, k] / np.abs(signal).max()
+        assert np.allclose(motion.actuation[:, there], wanted[:, None], atol=1e-6)
+    assert np.all(motion.actuation[:, body.simulation.particles.actuator < 0] == 0.0)
+
+
 def test_solid_is_drawn_above_void():
     motion = made_up([(0.2, 0.2), (0.2, 0.2)], 2 * [np.eye(2)], [1.0, 0.1], [0.0, 0.0])
     _, colour = drawn(motion, [(0.1, 0.1), (0.3, 0.3)])

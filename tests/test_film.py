@@ -2,6 +2,7 @@
 
 import os
 import re
+import resource
 import signal
 import subprocess
 import sys
@@ -185,6 +186,21 @@ def test_a_length_that_makes_no_sense_is_refused(short_run, tmp_path, seconds):
     with pytest.raises(DesignError, match="seconds"):
         film(tmp_path / "film.gif", short_run, seconds)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.skipif(not hasattr(resource, "RLIMIT_FSIZE"), reason="needs a file-size limit")
+def test_a_full_disk_leaves_an_older_film_as_it_was(short_run, tmp_path):
+    target = tmp_path / "film.gif"
+    target.write_text("an older film")
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, before[1]))
+    try:
+        with pytest.raises(StorageError, match="make room"):
+            film(target, short_run, seconds=1.0)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert [file.name for file in tmp_path.iterdir()] == [target.name]
+    assert target.read_text() == "an older film"
 
 
 @pytest.mark.parametrize("ending", ["gif", "mp4"])
