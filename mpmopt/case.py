@@ -54,7 +54,10 @@ class Case:
 
 
 def _sharpening(time_step: float, stages: int, coarsening: int = 1) -> tuple[Stage, ...]:
-    """Beta doubled from 0.5; from 8 on, clear void is left out and designs are judged solid."""
+    """Beta doubled from 0.5; from 8 on, clear void is left out and designs are judged solid.
+
+    On the scene's own cells they count with the least of their audit.
+    """
     return tuple(
         Stage(
             beta=0.5 * 2**k,
@@ -62,6 +65,7 @@ def _sharpening(time_step: float, stages: int, coarsening: int = 1) -> tuple[Sta
             stiffness_floor=1e-3,
             time_step=time_step,
             solid=k >= 4,
+            audited=k >= 4 and coarsening == 1,
             coarsening=coarsening,
             leave_out=0.05 if k >= 4 else 0.0,
         )
@@ -84,7 +88,16 @@ def refined(coarse_time_step: float, time_step: float) -> Settings:
     """
     coarse = _sharpening(coarse_time_step, stages=5, coarsening=2)
     fine = tuple(
-        Stage(beta, 1e-2, 1e-3, time_step, solid=True, move_limit=move_limit, leave_out=0.05)
+        Stage(
+            beta,
+            mass_floor=1e-2,
+            stiffness_floor=1e-3,
+            time_step=time_step,
+            solid=True,
+            audited=True,
+            move_limit=move_limit,
+            leave_out=0.05,
+        )
         for beta, move_limit, repeats in ((8.0, 0.05, 1), (16.0, 0.05, 4), (32.0, 0.025, 3))
         for _ in range(repeats)
     )

@@ -44,9 +44,10 @@ class Iteration:
         Since the optimisation began, without the time between a stop and going on.
     post_processed : float
         L without void, or not a number if the stage does not ask for it or it failed.
-    finer : float
-        L without void on cells half as wide; not a number if the stage does not ask for it or the
-        design could not be its best anyway, minus infinity if it failed.
+    audited : float
+        L without void with half the step or cells half as wide, whichever is less; not a number if
+        the stage does not ask for it or the design could not be its best anyway, minus infinity if
+        it failed.
     redone : int
         How often the stage's time step was halved for this evaluation.
     courant, spin, jacobian, stretch : float
@@ -66,7 +67,7 @@ class Iteration:
     step: float
     seconds: float
     post_processed: float = np.nan
-    finer: float = np.nan
+    audited: float = np.nan
     redone: int = 0
     courant: float = np.nan
     spin: float = np.nan
@@ -76,8 +77,8 @@ class Iteration:
 
     @property
     def counted(self) -> float:
-        """L without void, on the worse of the grids it was asked for; minus infinity if none."""
-        least = float(np.fmin(self.post_processed, self.finer))
+        """L without void, the least that was found; minus infinity if there is none."""
+        least = float(np.fmin(self.post_processed, self.audited))
         return -np.inf if np.isnan(least) else least
 
     def numbers(self) -> dict[str, Any]:

@@ -46,10 +46,10 @@ class Stage:
         Whether the best design is the one that goes farthest once its void is removed
         (`binary.post_processed`), which costs a forward run more, instead of as it is. The climb
         itself goes on from the one that goes farthest as it is.
-    finer : bool
-        Whether such a design counts with the lesser of this and of the same on cells half as wide
-        (`audit.finer`), so that the best is one that keeps its gain there. This costs three
-        gradients more for each design that goes farther than the best so far.
+    audited : bool
+        Whether such a design counts with the least of this and of the same with half the step and
+        with cells half as wide (`audit.least`), so that the best is one that keeps its gain. This
+        costs four gradients more for each design that goes farther than the best so far.
     coarsening : int
         How many of the scene's cells go into the width of this stage's: early stages need no more.
     move_limit : float
@@ -72,7 +72,7 @@ class Stage:
     stiffness_floor: float
     time_step: float
     solid: bool = False
-    finer: bool = False
+    audited: bool = False
     coarsening: int = 1
     move_limit: float = 0.05
     leave_out: float = 0.0
@@ -87,8 +87,8 @@ class Stage:
             raise DesignError(f"Stage: move_limit = {self.move_limit} must be at most 1")
         leave_out = share("Stage", "leave_out", self.leave_out, error=DesignError)
         object.__setattr__(self, "leave_out", leave_out)
-        if self.finer and not self.solid:
-            raise DesignError("Stage: finer = True needs solid = True")
+        if self.audited and not self.solid:
+            raise DesignError("Stage: audited = True needs solid = True")
         if self.most_iterations is not None:
             most = count("Stage", "most_iterations", self.most_iterations, 1, error=DesignError)
             object.__setattr__(self, "most_iterations", most)
@@ -401,14 +401,14 @@ class _StageRun:
         except SimulationError as error:
             failure = str(error)
             logger.warning("evaluation %d failed: %s", len(run.history), error)
-        solid = finer = np.nan
+        solid = audited = np.nan
         if self.stage.solid and not failure:
             solid = self._without_void(post_processed, problem.at(time_step), x)
             best = run.best.get(self.leg.stage)
             hopeful = solid > (best.counted if best else -np.inf)
-            if self.stage.finer and hopeful:
-                finer = self._without_void(audit.finer, problem.at(time_step), x)
-                finer = -np.inf if np.isnan(finer) else finer
+            if self.stage.audited and hopeful:
+                audited = self._without_void(audit.least, problem.at(time_step), x)
+                audited = -np.inf if np.isnan(audited) else audited
         before = run.last.x if run.last else x
         if before.size != x.size:  # another grid
             before = x
@@ -428,7 +428,7 @@ class _StageRun:
             step=float(np.abs(x - before).max() / 2.0),
             seconds=time.monotonic() - self.whole.began,
             post_processed=solid,
-            finer=finer,
+            audited=audited,
             redone=redone,
             courant=margins.courant,
             spin=margins.spin,
@@ -464,7 +464,7 @@ class _StageRun:
             return True
         if not self.stage.solid:
             return item.objective > best.objective
-        if self.stage.finer and np.isnan(item.finer):
+        if self.stage.audited and np.isnan(item.audited):
             return False
         return (item.counted, item.objective) > (best.counted, best.objective)
 

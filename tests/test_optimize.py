@@ -184,40 +184,42 @@ def test_the_result_is_the_design_that_goes_farthest_without_void(scene, start):
     assert run.result.post_processed == max(item.post_processed for item in run.history)
 
 
-def test_a_design_counts_with_what_it_does_on_finer_cells(scene, start, monkeypatch):
+def test_a_design_counts_with_the_least_of_its_audit(scene, start, monkeypatch):
     solid = iter((0.1, 0.4, 0.2, 0.15, 0.3, np.nan, 0.5))
-    finer = iter((0.05, 0.15, 0.3, SimulationError("torn", 1, -1, (0.0, 0.0), "none"), 0.45))
+    found = iter((0.05, 0.15, 0.3, SimulationError("torn", 1, -1, (0.0, 0.0), "none"), 0.45))
     asked = []
 
     def post_processed(problem, x):
         return next(solid)
 
-    def on_finer_cells(problem, x):
+    def least(problem, x):
         asked.append(x)
-        value = next(finer)
+        value = next(found)
         if isinstance(value, Exception):
             raise value
         return value
 
     monkeypatch.setattr("mpmopt.optimize.post_processed", post_processed)
-    monkeypatch.setattr("mpmopt.audit.finer", on_finer_cells)
-    stage = dataclasses.replace(STAGES[1], finer=True)
+    monkeypatch.setattr("mpmopt.audit.least", least)
+    stage = dataclasses.replace(STAGES[1], audited=True)
     settings = Settings((stage,), window=1, least_iterations=7, most_iterations=7)
     run, designs = tried(scene, settings, start)
     counted = [item.counted for item in run.history]
     assert counted == [0.05, 0.15, 0.2, 0.15, -np.inf, -np.inf, 0.45]
-    assert [len(asked), run.result.post_processed, run.result.finer] == [5, 0.5, 0.45]
+    assert [len(asked), run.result.post_processed, run.result.audited] == [5, 0.5, 0.45]
     assert np.array_equal(run.result.x, designs[6].x)
 
 
-def test_what_a_finer_stage_asks_is_what_the_audit_tells(scene, start):
-    stage = dataclasses.replace(STAGES[1], finer=True)
+def test_what_an_audited_stage_asks_is_what_the_audit_tells(scene, start):
+    stage = dataclasses.replace(STAGES[1], audited=True)
     settings = Settings((stage,), window=1, least_iterations=4, most_iterations=4)
     run = optimise(scene, settings, start)
     rows = {row.name: row for row in audit.audit(run.problem(), run.result.x)}
-    assert run.result.finer == rows["cells half as wide"].distance
+    others = rows["half the step"].distance, rows["cells half as wide"].distance
+    assert run.result.audited == min(others)
+    assert others[0] != others[1]
     assert run.result.post_processed == rows["as designed"].distance
-    assert run.result.counted == min(run.result.finer, run.result.post_processed)
+    assert run.result.counted == min(run.result.audited, run.result.post_processed)
 
 
 def test_of_several_starts_the_best_goes_on(scene, start):
@@ -288,7 +290,7 @@ def test_a_stage_that_never_runs_gives_up_after_three_halvings(scene, start, mon
         {"coarsening": 1.5},
         {"leave_out": -0.1},
         {"leave_out": 1.0},
-        {"finer": True},
+        {"audited": True},
         {"most_iterations": 0},
     ],
 )
