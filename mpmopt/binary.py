@@ -12,7 +12,7 @@ from mpmopt.actuation import signal
 from mpmopt.errors import DesignError, SimulationError
 from mpmopt.objective import Objective
 from mpmopt.particles import lay_out
-from mpmopt.problem import Problem, Variables
+from mpmopt.problem import Problem, Variables, refuse_beyond_limits
 from mpmopt.scene import Scene
 from mpmopt.simulate import Simulation
 
@@ -37,8 +37,11 @@ def solid_body(
     Raises
     ------
     DesignError
-        If `keep` has another size.
+        If `keep` has another size, or the actuation is not within [-1, 1].
     """
+    for name in ("a", "theta", "b"):
+        if not np.all(np.abs(getattr(variables, name)) <= 1.0):
+            raise DesignError(f"{name} = {getattr(variables, name)} must be within [-1, 1]")
     particles = lay_out(scene)
     designed = int(particles.designed.sum())
     if np.shape(keep) != (designed,):
@@ -64,11 +67,15 @@ def distance(scene: Scene, keep: NDArray[np.bool_], variables: Variables) -> flo
 
     Raises
     ------
-    DesignError, SimulationError
-        As the simulation does.
+    DesignError
+        As `solid_body`.
+    SimulationError
+        If the simulation fails, or comes too close to it (`problem.LIMITS`).
     """
     simulation, objective = solid_body(scene, keep, variables)
-    return float(objective.value(simulation.run()))
+    state, margins = simulation.watch()
+    refuse_beyond_limits(margins, simulation)
+    return float(objective.value(state))
 
 
 def post_processed(problem: Problem, x: NDArray, threshold: float = THRESHOLD) -> float:

@@ -89,8 +89,8 @@ def damaged(path, change, seal=True):
     """A run file that was changed; sealed again, so that its digest does not tell."""
     with h5py.File(path, "r+") as file:
         change(file)
-        if seal:
-            file.attrs["digest"] = runfile.digest(file)
+    if seal:
+        path.write_bytes(runfile.sealed(path.read_bytes()))
     return path
 
 
@@ -131,7 +131,6 @@ def test_a_damaged_run_file_is_refused(path, change):
         lambda f: f["last"].attrs.update(objective=9.0),
         lambda f: f.pop("best"),
         lambda f: f.create_group("new"),
-        lambda f: f.attrs.pop("digest"),
     ],
 )
 def test_whatever_changed_since_it_was_written_is_noticed(path, change):
