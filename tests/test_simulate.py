@@ -78,7 +78,7 @@ def test_a_particle_that_leaves_the_grid_ends_the_run_by_name(scene):
     assert "larger grid" in str(error.value)
 
 
-@pytest.mark.parametrize("gravity", [1e6, 1e150, 1e306])
+@pytest.mark.parametrize("gravity", [1e6, 1e18, 1e30])
 def test_a_particle_that_leaves_in_the_last_step_is_found_too(scene, gravity):
     last = dataclasses.replace(scene, steps=1, gravity=(gravity, 0.0), walls=())
     with pytest.raises(SimulationError, match=r"left the grid|not a number") as error:
