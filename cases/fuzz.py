@@ -28,7 +28,8 @@ from hypothesis import strategies as st
 from mpmopt import runfile
 from mpmopt.binary import post_processed
 from mpmopt.errors import MpmoptError
-from mpmopt.optimize import Settings, Stage, optimise
+from mpmopt.history import Optimisation
+from mpmopt.optimize import Settings, Stage, go_on, optimise
 from mpmopt.problem import Problem
 from mpmopt.scene import Actuator, Design, Grid, Material, Mirror, Scene, Solid, Wall
 
@@ -185,7 +186,9 @@ def text(draw: Any) -> str:
             else:
                 there[draw(st.sampled_from(["colour", key.upper(), "\ud800", ""]))] = there[key]
     with_whole = json.dumps(data, default=str) if not _has_giant(data) else "1" + 5000 * "0"
-    kind = draw(st.sampled_from(["whole"] * 4 + ["cut", "flipped", "twice", "deep", "long", "other"]))
+    kind = draw(
+        st.sampled_from(["whole"] * 4 + ["cut", "flipped", "twice", "deep", "long", "other"])
+    )
     k = draw(st.integers(0, max(len(with_whole) - 1, 0)))
     if kind == "cut":
         return with_whole[:k]
@@ -329,13 +332,13 @@ def _dataset(name: str, **options: Any) -> Callable[[h5py.File], None]:
 def _virtual(file: h5py.File) -> None:
     layout = h5py.VirtualLayout(shape=(35,), dtype="f8")
     layout[:] = h5py.VirtualSource("elsewhere.h5", "x", shape=(35,))
-    file.pop("stages/0/x")
-    file.create_virtual_dataset("stages/0/x", layout)
+    file.pop("legs/0/stages/0/x")
+    file.create_virtual_dataset("legs/0/stages/0/x", layout)
 
 
 def _cycle(file: h5py.File) -> None:
     for k in range(50):
-        file[f"stages/0/back{k}"] = file["stages"]
+        file[f"legs/0/stages/0/back{k}"] = file["legs"]
 
 
 def _deep(file: h5py.File) -> None:
@@ -367,36 +370,48 @@ CHANGES: list[Callable[[h5py.File], Any]] = [
     lambda f: f["best"].attrs.update(stage=99),
     lambda f: f["best"].attrs.update(stage=np.inf),
     lambda f: f["best"].attrs.update(stage="x"),
-    lambda f: f["stages/0"].attrs.update(time_step=np.nan),
-    lambda f: f["stages/0"].attrs.update(time_step=1e-300),
-    lambda f: f["stages/0"].attrs.update(time_step=1e3),
-    _link("scene_of_another" if False else "stages/0/x", h5py.ExternalLink("other.h5", "/x")),
-    _link("stages/0", h5py.ExternalLink("/etc/passwd", "/")),
+    lambda f: f["legs/0/stages/0"].attrs.update(time_step=np.nan),
+    lambda f: f["legs/0/stages/0"].attrs.update(time_step=1e-300),
+    lambda f: f["legs/0/stages/0"].attrs.update(time_step=1e3),
+    _link("legs/0/stages/0/x", h5py.ExternalLink("other.h5", "/x")),
+    _link("legs/0/stages/0", h5py.ExternalLink("/etc/passwd", "/")),
     _link("history", h5py.SoftLink("/history")),
     _link("history/beta", h5py.SoftLink("/stages/0/x")),
-    _dataset("stages/0/x", data=OBJECTS),
-    _dataset("stages/0/x", shape=(BIG,), dtype="f8", chunks=(1024,)),
-    _dataset("stages/0/x", shape=(BIG,), dtype="f8"),
+    _dataset("legs/0/stages/0/x", data=OBJECTS),
+    _dataset("legs/0/stages/0/x", shape=(BIG,), dtype="f8", chunks=(1024,)),
+    _dataset("legs/0/stages/0/x", shape=(BIG,), dtype="f8"),
     _dataset("history/beta", shape=(BIG,), dtype="f8", chunks=(1024,), compression="gzip"),
     _dataset("history/failure", shape=(BIG,), dtype=h5py.string_dtype(), chunks=(1024,)),
     _dataset("history/failure", data=np.arange(3.0)),
     _dataset("history/failure", shape=(3,), dtype=h5py.ref_dtype),
     _dataset("history/failure", shape=(3,), dtype=h5py.vlen_dtype(np.float64)),
-    _dataset("stages/0/x", shape=(35,), dtype="f8", external=[("/etc/passwd", 0, 280)]),
-    _dataset("stages/0/x", data=np.full(35, np.nan)),
-    _dataset("stages/0/x", data=np.zeros(34)),
-    _dataset("stages/0/x", data=np.zeros(35, np.complex128)),
-    _dataset("stages/0/x", data=np.zeros(35, [("a", "f8")])),
-    _dataset("stages/0/x", data=np.zeros((35, 1))),
-    _dataset("stages/0/x", data=3.0),
-    _dataset("stages/0/x", dtype=np.float64),
+    _dataset("legs/0/stages/0/x", shape=(35,), dtype="f8", external=[("/etc/passwd", 0, 280)]),
+    _dataset("legs/0/stages/0/x", data=np.full(35, np.nan)),
+    _dataset("legs/0/stages/0/x", data=np.zeros(34)),
+    _dataset("legs/0/stages/0/x", data=np.zeros(35, np.complex128)),
+    _dataset("legs/0/stages/0/x", data=np.zeros(35, [("a", "f8")])),
+    _dataset("legs/0/stages/0/x", data=np.zeros((35, 1))),
+    _dataset("legs/0/stages/0/x", data=3.0),
+    _dataset("legs/0/stages/0/x", dtype=np.float64),
     _virtual,
     _cycle,
     _deep,
-    lambda f: f.create_group("stages/9"),
-    lambda f: f.create_group("stages/-1"),
-    lambda f: f.create_group("stages/" + "9" * 5000),
+    lambda f: f.create_group("legs/0/stages/9"),
+    lambda f: f.create_group("legs/0/stages/-1"),
+    lambda f: f.create_group("legs/0/stages/" + "9" * 5000),
     lambda f: f.pop("best"),
+    lambda f: f.pop("legs/0"),
+    lambda f: f.attrs.update(leg=7),
+    lambda f: f.attrs.update(leg=-1),
+    lambda f: f["legs/0"].attrs.update(start=np.nan),
+    lambda f: f["last"].attrs.update(stage=2**62),
+    lambda f: f["last"].attrs.update(objective="far"),
+    lambda f: f["first"].attrs.pop("beta"),
+    lambda f: f["stage/mma"].pop("lower"),
+    _dataset("stage/mma/x_previous", data=np.full(3, np.nan)),
+    _dataset("stage/values", data=np.zeros(0)),
+    lambda f: f.create_dataset("drawing/1", data=np.zeros(3)),
+    lambda f: f.create_dataset("drawing/x", data=np.zeros(3, bool)),
 ]
 
 
@@ -420,6 +435,7 @@ def damage(content: bytes, kind: str, how: Any, path: Path) -> None:
         path.write_bytes(content)
         with h5py.File(path, "r+") as file:
             CHANGES[how](file)
+        path.write_bytes(runfile.sealed(path.read_bytes()))
         return
     changed = bytearray(content)
     for share, by in how:
@@ -436,16 +452,22 @@ def damage(content: bytes, kind: str, how: Any, path: Path) -> None:
 
 
 def run_file(path: Path) -> None:
-    """Read a run file and use what is in it."""
-    run = runfile.read(path)
-    _finite(run.problem().gamma(run.best))
+    """Read a run file, use what is in it, and go on with it."""
+    found = runfile.read(path)
+    _finite(found.problem().gamma(found.best), found.history["objective"])
+    go_on(found.run)
 
 
 def small_run(path: Path) -> bytes:
-    """The content of a run file, written by a short optimisation."""
+    """The content of a run file, written by a short optimisation that was then stopped."""
     stages = (Stage(0.5, 1e-2, 1e-3, 4e-3), Stage(2.0, 1e-2, 1e-3, 4e-3, solid=True))
     how = Settings(stages, window=2, least_iterations=2, most_iterations=3)
-    runfile.write(path, optimise(SMALL, how, Problem(SMALL).join(0.0, 1.0, -0.3, -0.5)))
+
+    def write(run: Optimisation) -> None:
+        if len(run.history) == 5:
+            runfile.write(path, run)
+
+    optimise(SMALL, how, Problem(SMALL).join(0.0, 1.0, -0.3, -0.5), [write])
     return path.read_bytes()
 
 

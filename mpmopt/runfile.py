@@ -40,6 +40,7 @@ from mpmopt.problem import Problem, Variables
 from mpmopt.scene import Scene
 
 FORMAT, VERSION = "mpmopt run", 3
+LARGEST = 10**9  # bytes of a run file
 SEAL = 80  # bytes of the digest at the end
 WHOLE = tuple(f.name for f in dataclasses.fields(Iteration) if f.type == "int")
 COLUMNS = tuple(f.name for f in dataclasses.fields(Iteration) if f.type in ("int", "float"))
@@ -224,6 +225,11 @@ def sealed(image: bytes) -> bytes:
 
 def _check_seal(path: Path) -> None:
     """HDF5 may read a damaged file for ever, so it sees none."""
+    if path.stat().st_size > LARGEST:
+        raise RunFileError(
+            f"{path} has {path.stat().st_size} bytes, more than {LARGEST:.0e}: no run file is so "
+            "large"
+        )
     content = path.read_bytes()
     image = content[:-SEAL]
     found, wanted = sealed(image)[-SEAL:], content[-SEAL:]
