@@ -280,7 +280,7 @@ ENTRIES = [0.0, 1.0, -1.0, 1.0 + 1e-16, 1.0 + 1e-15, -1.5, 1e300, 5e-324, np.nan
 
 
 @st.composite
-def designs(draw: Any) -> Any:
+def variables(draw: Any) -> Any:
     """Design variables: in bounds, at bounds, beyond; with odd entries; of any shape and kind."""
     if draw(st.integers(0, 3)) == 0:
         return draw(st.sampled_from(ODD_DESIGNS))
@@ -511,14 +511,14 @@ def _each(strategy: Any, number: int, action: Callable[[Any], None]) -> None:
         run()
 
 
-def fuzz(scenes: int, designs_: int, files: int) -> list[Row]:
+def fuzz(scenes: int, designs: int, files: int) -> list[Row]:
     """Try so many of each.
 
     Parameters
     ----------
     scenes : int
         Half of them as objects, half as JSON text.
-    designs_ : int
+    designs : int
     files : int
         Damaged run files.
     """
@@ -536,8 +536,8 @@ def fuzz(scenes: int, designs_: int, files: int) -> list[Row]:
     _each(st.tuples(text(), kinds), scenes // 2, scene_from(texts, Scene.from_json))
     problem = Problem(SMALL)
     _each(
-        st.tuples(designs(), kinds),
-        designs_,
+        st.tuples(variables(), kinds),
+        designs,
         lambda pair: _note(design_row, pair, lambda: run_design(problem, *pair)),
     )
     if files:

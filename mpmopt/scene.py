@@ -442,11 +442,7 @@ class Scene(_Checked):
         particles, actuators = sum(areas), len(self.actuators)
         nodes = math.prod((b - a) // self.particles_per_cell + 4 for a, b in zip(lower, upper))
         designed = sum(a for a, region in zip(areas, self.body) if isinstance(region, Design))
-        # Weights further away than six standard deviations are left out (`design.NEGLIGIBLE`).
-        _, w1, w2 = self.filter_weights
-        spread = math.sqrt(2.0 * self.filter_passes * (w1 + 2.0 * w2))
-        reach = 2 * math.ceil(min(self.filter_passes, 6.0 * spread) + 3)
-        neighbours = min(designed, (reach * self.particles_per_cell) ** 2)
+        neighbours = min(designed, self.filter_neighbours)
         for what, numbers, cure in (
             (f"{particles} particles", 12 * particles, "larger cells or fewer particles per cell"),
             (f"a body that spans {nodes} nodes", 4 * nodes, "larger cells or a smaller body"),
@@ -611,6 +607,15 @@ class Scene(_Checked):
         _, w1, w2 = self.filter_weights
         cells = self.filter_length / self.grid.dx
         return max(1, round((cells**2 - 0.5) / (2.0 * (w1 + 2.0 * w2))))
+
+    @property
+    def filter_neighbours(self) -> int:
+        """Particles from which the filter takes at most, where all around are designed."""
+        # Weights further away than six standard deviations are left out (`design.NEGLIGIBLE`).
+        _, w1, w2 = self.filter_weights
+        spread = math.sqrt(2.0 * self.filter_passes * (w1 + 2.0 * w2))
+        reach = 2 * math.ceil(min(self.filter_passes, 6.0 * spread) + 3)
+        return (reach * self.particles_per_cell) ** 2
 
     def vary(
         self,
