@@ -18,7 +18,7 @@ from mpmopt.checks import shown
 from mpmopt.energy import Balance
 from mpmopt.errors import DesignError, SimulationError, StorageError
 from mpmopt.particles import Particles
-from mpmopt.scene import ROUNDING, Scene
+from mpmopt.scene import MOST_NUMBERS, ROUNDING, Scene
 from mpmopt.threads import together
 
 Precision = Literal["double", "single"]
@@ -422,7 +422,26 @@ class _Segment:
         self.logs = memory.take("logs", (length, groups, 4), dtype)
         self.grids = np.empty((length, simulation.sheets, 0, mpm.NODE_SIZE), dtype)
         self.recomputed: set[int] = set()  # segments whose windows outgrew their room in the store
-        self.resize(*simulation.room)
+        kept = length * simulation.sheets * simulation.room[0] * mpm.NODE_SIZE
+        self.most = max(MOST_NUMBERS, 4 * kept)
+        self.make_room(*simulation.room, 0)
+
+    def make_room(self, nodes: int, part: int, step: int) -> None:
+        """`resize`, unless that would take far more memory than the run began with."""
+        length, sheets, _, _ = self.grids.shape
+        kept = length * sheets * nodes * mpm.NODE_SIZE
+        shared = max(self.blocks, 2 * 9) * sheets * part * mpm.NODE_SIZE
+        if kept > self.most or shared > MOST_NUMBERS:
+            raise SimulationError(
+                f"particles are spread over {nodes} nodes, those of a block over {part}, which "
+                f"takes {max(kept, shared):.3g} numbers, more than {self.most:.3g}",
+                step,
+                -1,
+                (math.nan, math.nan),
+                "let no part of the body fly away: take a smaller time step (now "
+                f"{self.simulation.scene.time_step:g}), weaker actuation, or a smaller grid",
+            )
+        self.resize(nodes, part)
 
     def resize(self, nodes: int, part: int) -> None:
         """Make room for windows of so many nodes, and so many in a block's, keeping the grids."""
@@ -460,9 +479,9 @@ class _Segment:
             nodes, part = self.grids.shape[2], self.scratch.parts.shape[2]
             window = self.windows[reached % len(self.windows), :, 2:].prod(axis=1)
             if end == mpm.WINDOW_TOO_SMALL:
-                self.resize(int(1.25 * window[-1]), part)
+                self.make_room(int(1.25 * window[-1]), part, first + reached)
             elif end == mpm.PART_TOO_SMALL:
-                self.resize(nodes, int(1.25 * window[:-1].max()))
+                self.make_room(nodes, int(1.25 * window[:-1].max()), first + reached)
             elif end != mpm.DONE:
                 shape = simulation.initial.shape
                 particle = min(particle, shape[1] - 1)
