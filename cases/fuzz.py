@@ -4,6 +4,9 @@
 
 Refused means: an error of the package's own. Anything else counts as a failure: another exception,
 a warning, a result that is not finite, more than 4 GB of memory, more than a minute.
+
+Compiled kernels reach records by pointers, which NUMBA_BOUNDSCHECK=1 does not see. With
+NUMBA_DISABLE_JIT=1 they are plain Python, and every index into records is checked here.
 """
 
 import argparse
@@ -24,8 +27,9 @@ import h5py
 import numpy as np
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
+from numba import config
 
-from mpmopt import runfile
+from mpmopt import mpm, runfile
 from mpmopt.binary import post_processed
 from mpmopt.errors import MpmoptError
 from mpmopt.history import Optimisation
@@ -553,6 +557,22 @@ def fuzz(scenes: int, designs: int, files: int) -> list[Row]:
     return [row for row in (objects, texts, design_row, file_row) if row.tried]
 
 
+def check_indices() -> None:
+    """Let the kernels' accesses to records, as plain Python functions, check their indices."""
+
+    def checked(access: Callable[..., Any]) -> Callable[..., Any]:
+        def within(array: np.ndarray, k: int, *rest: Any) -> Any:
+            records = len(array) if array.ndim == 2 else len(array) // 2
+            if not 0 <= k < records:
+                raise IndexError(f"{access.__name__}: record {k} of {records}")
+            return access(array, k, *rest)
+
+        return within
+
+    for name in ("load", "store", "number", "set_number"):
+        setattr(mpm, name, checked(getattr(mpm, name)))
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -561,6 +581,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--json", type=Path, help="leave the rows here too")
     arguments = parser.parse_args(argv)
     used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    if config.DISABLE_JIT:
+        check_indices()
     hard = resource.getrlimit(resource.RLIMIT_AS)[1]
     resource.setrlimit(resource.RLIMIT_AS, (used + MEMORY, hard))
     rows = fuzz(arguments.scenes, arguments.designs, arguments.files)

@@ -29,7 +29,7 @@ def test_scenes_designs_and_run_files_run_or_are_refused():
 def test_the_long_version_in_a_process_of_its_own(tmp_path, mode):
     # Indices are checked where kernels do not use pointers (bounds check), and where they do
     # (plain Python, of which less is done in the time).
-    share = 20 if "NUMBA_DISABLE_JIT" in mode else 1
+    share = 4 if "NUMBA_DISABLE_JIT" in mode else 1
     counts = {"scenes": 2000 // share, "designs": 500 // share, "files": 500 // share}
     options = [f"--{name}={number}" for name, number in counts.items()]
     cases = Path(__file__).parent.parent / "cases"
