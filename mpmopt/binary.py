@@ -40,8 +40,9 @@ def solid_body(
         If `keep` has another size, or the actuation is not within [-1, 1].
     """
     for name in ("a", "theta", "b"):
-        if not np.all(np.abs(getattr(variables, name)) <= 1.0):
-            raise DesignError(f"{name} = {getattr(variables, name)} must be within [-1, 1]")
+        value = getattr(variables, name)
+        if np.iscomplexobj(value) or not np.all(np.abs(value) <= 1.0):
+            raise DesignError(f"{name} = {value} must be real and within [-1, 1]")
     particles = lay_out(scene)
     designed = int(particles.designed.sum())
     if np.shape(keep) != (designed,):

@@ -404,7 +404,7 @@ def _read_candidate(parent: h5py.Group, name: str) -> Candidate | None:
 
 
 def _read_stage(group: h5py.Group) -> StageState:
-    return StageState(
+    state = StageState(
         time_step=float(group.attrs["time_step"]),
         failures=int(group.attrs["failures"]),
         values=_numbers(group, "values"),
@@ -413,6 +413,10 @@ def _read_stage(group: h5py.Group) -> StageState:
         farthest_gradient=_numbers(group, "farthest_gradient"),
         mma={name: item[()] for name, item in group["mma"].items()},
     )
+    farthest = 0 if state.farthest is None else state.farthest.x.size
+    if state.farthest_gradient.size != farthest or (state.gradient.size and not state.values.size):
+        raise ValueError("a stage whose values, gradients and designs do not fit together")
+    return state
 
 
 def _numbers(group: h5py.Group, name: str) -> NDArray[np.float64]:

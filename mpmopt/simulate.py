@@ -431,16 +431,17 @@ class _Segment:
         length, sheets, _, _ = self.grids.shape
         kept = length * sheets * nodes * mpm.NODE_SIZE
         shared = max(self.blocks, 2 * 9) * sheets * part * mpm.NODE_SIZE
-        if kept > self.most or shared > MOST_NUMBERS:
-            raise SimulationError(
-                f"particles are spread over {nodes} nodes, those of a block over {part}, which "
-                f"takes {max(kept, shared):.3g} numbers, more than {self.most:.3g}",
-                step,
-                -1,
-                (math.nan, math.nan),
-                "let no part of the body fly away: take a smaller time step (now "
-                f"{self.simulation.scene.time_step:g}), weaker actuation, or a smaller grid",
-            )
+        for numbers, most in ((kept, self.most), (shared, MOST_NUMBERS)):
+            if numbers > most:
+                raise SimulationError(
+                    f"particles are spread over {nodes} nodes, those of a block over {part}, which "
+                    f"takes {numbers:.3g} numbers, more than {most:.3g}",
+                    step,
+                    -1,
+                    (math.nan, math.nan),
+                    "let no part of the body fly away: take a smaller time step (now "
+                    f"{self.simulation.scene.time_step:g}), weaker actuation, or a smaller grid",
+                )
         self.resize(nodes, part)
 
     def resize(self, nodes: int, part: int) -> None:

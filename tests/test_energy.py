@@ -156,7 +156,10 @@ def test_a_body_without_void_that_is_torn_has_no_distance():
     assert np.isfinite(distance(scene, keep, push))
 
 
-@pytest.mark.parametrize("wrong", [{"a": np.array([1.0, 1.5])}, {"b": np.array([np.nan, 0.0])}])
+@pytest.mark.parametrize(
+    "wrong",
+    [{"a": np.array([1.0, 1.5])}, {"b": np.array([np.nan, 0.0])}, {"theta": np.array([0j, 0.0])}],
+)
 def test_actuation_beyond_its_bounds_is_refused(wrong):
     push = Variables(np.zeros(0), np.ones(2), np.zeros(2), np.zeros(2))._replace(**wrong)
     with pytest.raises(DesignError, match=next(iter(wrong))):

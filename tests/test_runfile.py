@@ -188,6 +188,14 @@ def virtual(file):
         (lambda f: f.attrs.update(scene=np.zeros(9)), "attribute scene of / is neither"),
         (lambda f: f.attrs.create("leg", f.ref, dtype=h5py.ref_dtype), "attribute leg of / is"),
         (lambda f: f.attrs.update(settings=100000 * "["), "recursion"),
+        (
+            lambda f: (
+                f.create_group("stage").attrs.update(time_step=1.0, failures=0),
+                f["stage"].update({"values": [], "gradient": [1.0], "farthest_gradient": []}),
+                f["stage"].create_group("mma"),
+            ),
+            "do not fit together",
+        ),
     ],
 )
 def test_what_no_run_file_holds_is_refused_before_it_is_read(path, change, says):
