@@ -526,8 +526,9 @@ def fuzz(scenes: int, designs: int, files: int) -> list[Row]:
     files : int
         Damaged run files.
     """
-    for kind in range(4):
-        run_scene(SMALL, kind)  # compile all kernels that are not cached
+    for kind in range(4):  # compile all kernels that are not cached
+        run_scene(SMALL, kind)
+    Problem(SMALL).value(np.zeros(SIZE, complex))
     objects, texts = Row("scenes as objects"), Row("scenes as JSON text")
     design_row, file_row = Row("designs"), Row("damaged run files")
     kinds = st.integers(0, 3)

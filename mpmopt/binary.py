@@ -12,7 +12,7 @@ from mpmopt.actuation import signal
 from mpmopt.errors import DesignError, SimulationError
 from mpmopt.objective import Objective
 from mpmopt.particles import lay_out
-from mpmopt.problem import Problem, Variables, refuse_beyond_limits
+from mpmopt.problem import Problem, Variables, refuse_nonsense
 from mpmopt.scene import Scene
 from mpmopt.simulate import Simulation
 
@@ -71,11 +71,11 @@ def distance(scene: Scene, keep: NDArray[np.bool_], variables: Variables) -> flo
     DesignError
         As `solid_body`.
     SimulationError
-        If the simulation fails, or comes too close to it (`problem.LIMITS`).
+        If the simulation fails, its solid is torn, or energy appears from nowhere.
     """
     simulation, objective = solid_body(scene, keep, variables)
     state, margins = simulation.watch()
-    refuse_beyond_limits(margins, simulation)
+    refuse_nonsense(margins, simulation)
     return float(objective.value(state))
 
 

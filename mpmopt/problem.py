@@ -306,26 +306,32 @@ class Problem:
 
     def _check(self, margins: Margins, simulation: Simulation) -> None:
         """A run that came too close to failure is a SimulationError, unless nothing is redone."""
-        if self.redo > 0:
-            refuse_beyond_limits(margins, simulation)
+        if self.redo == 0:
+            return
+        for what, value, limit in (
+            ("the Courant number of a stretched particle", margins.courant, LIMITS.courant),
+            ("dt |C| of a particle", margins.spin, LIMITS.spin),
+            ("1 / J of a particle", 1.0 / margins.jacobian, 1.0 / LIMITS.jacobian),
+        ):
+            if not value <= limit:
+                raise _too_long(simulation, f"{what} reached {value:.3g}, the limit is {limit:.3g}")
+        refuse_nonsense(margins, simulation)
 
 
-def refuse_beyond_limits(margins: Margins, simulation: Simulation) -> None:
-    """A run that came too close to failure to be trusted is an error.
+def refuse_nonsense(margins: Margins, simulation: Simulation) -> None:
+    """A run in which energy appeared from nowhere or solid was torn is an error.
 
     Raises
     ------
     SimulationError
         If its step is too long; a `TornError` if no step mends it.
     """
-    for what, value, limit in (
-        ("the Courant number of a stretched particle", margins.courant, LIMITS.courant),
-        ("dt |C| of a particle", margins.spin, LIMITS.spin),
-        ("1 / J of a particle", 1.0 / margins.jacobian, 1.0 / LIMITS.jacobian),
-        ("the share of energy that appears from nowhere", margins.energy, LIMITS.energy),
-    ):
-        if not value <= limit:
-            raise _too_long(simulation, f"{what} reached {value:.3g}, the limit is {limit:.3g}")
+    if not margins.energy <= LIMITS.energy:
+        raise _too_long(
+            simulation,
+            f"energy that appears from nowhere reached {margins.energy:.3g} of all that was turned "
+            f"over, the limit is {LIMITS.energy:.3g}",
+        )
     per_cell = simulation.scene.particles_per_cell
     limit = LIMITS.stretch * per_cell
     if not margins.stretch <= limit:
