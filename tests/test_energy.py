@@ -164,3 +164,26 @@ def test_actuation_beyond_its_bounds_is_refused(wrong):
     push = Variables(np.zeros(0), np.ones(2), np.zeros(2), np.zeros(2))._replace(**wrong)
     with pytest.raises(DesignError, match=next(iter(wrong))):
         distance(small_scene(), np.ones(32, dtype=bool), push)
+
+
+def test_ellipticity_in_shear_is_lost_where_scenes_say_whatever_the_deformation(rng):
+    # docs/failure.rst: m.Q(n)m = n.F (mu I + s S) F^T n for m across n, by finite differences.
+    mu, lam, step = 10.0, 7.0, 1e-6
+
+    def first_piola(F, sS):
+        J = np.linalg.det(F)
+        tau = mu * (F @ F.T - np.eye(2)) + lam * np.log(J) * np.eye(2) + F @ sS @ F.T
+        return tau @ np.linalg.inv(F).T
+
+    for _ in range(20):
+        F = np.eye(2) + rng.uniform(-0.5, 0.5, (2, 2))
+        if np.linalg.det(F) < 0.1:
+            continue
+        sS = rng.uniform(-12.0, 12.0, (2, 2))
+        sS = sS + sS.T
+        angle = rng.uniform(0.0, np.pi)
+        n, m = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
+        wave = step * np.outer(m, F.T @ n)
+        change = (first_piola(F + wave, sS) - first_piola(F - wave, sS)) / (2.0 * step)
+        shear = m @ change @ (F.T @ n)
+        assert shear == pytest.approx(n @ F @ (mu * np.eye(2) + sS) @ F.T @ n, abs=1e-6)
