@@ -278,7 +278,7 @@ ODD_DESIGNS = [
     np.zeros(SIZE, complex), np.full(SIZE, 1j * np.nan), np.zeros(SIZE, np.complex64),
     np.zeros(SIZE, object), np.zeros(SIZE, "S3"), np.zeros(SIZE, "M8[s]"), np.zeros(SIZE, bool),
     np.zeros(SIZE, np.float16), np.ones(SIZE, np.uint8), np.full(SIZE, 2**64 - 1, np.uint64),
-    np.ma.masked_all(SIZE), np.full(SIZE, np.longdouble("1e4000")), range(SIZE), object(),
+    np.ma.masked_less(np.zeros(SIZE), 1.0), np.full(SIZE, np.longdouble("1e4000")), range(SIZE), object(),
 ]  # fmt: skip
 ENTRIES = [0.0, 1.0, -1.0, 1.0 + 1e-16, 1.0 + 1e-15, -1.5, 1e300, 5e-324, np.nan, np.inf, -np.inf]
 

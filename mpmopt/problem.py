@@ -345,6 +345,8 @@ def refuse_nonsense(margins: Margins, simulation: Simulation) -> None:
 
 
 def _array(name: str, value: Any) -> NDArray:
+    if np.ma.is_masked(value):
+        raise DesignError(f"{name} has masked entries, which have no value; fill them")
     try:
         return np.asarray(value)
     except (ValueError, OverflowError) as error:

@@ -158,6 +158,13 @@ def test_what_is_no_array_of_numbers_is_refused(problem, value):
         problem.join(value, 0.0, 0.0, 0.0)
 
 
+def test_masked_entries_have_no_value(problem):
+    hidden = np.ma.masked_less(np.zeros(problem.size), 1.0)
+    with pytest.raises(DesignError, match="x has masked entries"):
+        problem.value(hidden)
+    assert problem.value(np.ma.array(np.zeros(problem.size))) == problem.value(np.zeros(38))
+
+
 def test_pieces_that_hang_on_nothing_are_numbered(problem):
     position = problem.particles.position[problem.particles.designed] * 32  # in spacings
     x, y = position.T
