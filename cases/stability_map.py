@@ -24,6 +24,7 @@ from stability import (
     actuation,
     adversary,
     contact,
+    energy,
     figure,
     fracture,
     gradients,
@@ -38,7 +39,8 @@ from stability.common import Found
 from mpmopt.runfile import replace_file
 
 MODULES = (
-    time_step, weak, adversary, actuation, inversion, fracture, contact, safe, gradients, optimiser,
+    time_step, weak, adversary, actuation, inversion, fracture, contact, energy, safe, gradients,
+    optimiser,
 )  # fmt: skip
 
 

@@ -12,7 +12,7 @@ from mpmopt.actuation import signal
 from mpmopt.errors import DesignError, SimulationError
 from mpmopt.objective import Objective
 from mpmopt.particles import lay_out
-from mpmopt.problem import Problem, Variables
+from mpmopt.problem import Problem, Variables, refuse_nonsense
 from mpmopt.scene import Scene
 from mpmopt.simulate import Simulation
 
@@ -37,8 +37,12 @@ def solid_body(
     Raises
     ------
     DesignError
-        If `keep` has another size.
+        If `keep` has another size, or the actuation is not within [-1, 1].
     """
+    for name in ("a", "theta", "b"):
+        value = getattr(variables, name)
+        if np.iscomplexobj(value) or not np.all(np.abs(value) <= 1.0):
+            raise DesignError(f"{name} = {value} must be real and within [-1, 1]")
     particles = lay_out(scene)
     designed = int(particles.designed.sum())
     if np.shape(keep) != (designed,):
@@ -64,11 +68,15 @@ def distance(scene: Scene, keep: NDArray[np.bool_], variables: Variables) -> flo
 
     Raises
     ------
-    DesignError, SimulationError
-        As the simulation does.
+    DesignError
+        As `solid_body`.
+    SimulationError
+        If the simulation fails, its solid is torn, or energy appears from nowhere.
     """
     simulation, objective = solid_body(scene, keep, variables)
-    return float(objective.value(simulation.run()))
+    state, margins = simulation.watch()
+    refuse_nonsense(margins, simulation)
+    return float(objective.value(state))
 
 
 def post_processed(problem: Problem, x: NDArray, threshold: float = THRESHOLD) -> float:

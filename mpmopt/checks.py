@@ -10,6 +10,17 @@ import numpy as np
 from mpmopt.errors import MpmoptError, SceneError
 
 MOST = 10**8  # of anything that is counted
+# Sizes of numbers that a scene may hold, so that products of several are finite and not zero.
+TINY, HUGE = 1e-30, 1e30
+
+
+def shown(value: Any) -> str:
+    """A value as it stands in a message: never long, whatever it is."""
+    try:
+        text = repr(value)
+    except (ValueError, RecursionError):  # a number of thousands of digits, lists in lists in lists
+        return f"a {type(value).__name__}"
+    return text if len(text) <= 80 else f"{text[:77]}..."
 
 
 def number(
@@ -20,17 +31,22 @@ def number(
     above: float = -math.inf,
     error: type[MpmoptError] = SceneError,
 ) -> float:
-    """`value` as a finite float above a limit, or an error."""
+    """`value` as a finite float above a limit, from `TINY` to `HUGE` in size or 0; or an error."""
     kinds = (int, float, np.integer, np.floating)
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, kinds):
-        raise error(f"{owner}: {name} = {value!r} must be a number")
+        raise error(f"{owner}: {name} = {shown(value)} must be a number")
     try:
         result = float(value)
     except OverflowError:
         result = math.inf
     if not math.isfinite(result) or not result > above:
         limit = "finite" if above == -math.inf else f"finite and above {above:g}"
-        raise error(f"{owner}: {name} = {value!r:.40} must be {limit}")
+        raise error(f"{owner}: {name} = {shown(value)} must be {limit}")
+    if result != 0.0 and not TINY <= abs(result) <= HUGE:
+        raise error(
+            f"{owner}: {name} = {result!r} must be 0 or from {TINY:g} to {HUGE:g} in size; take "
+            "other units"
+        )
     return result
 
 
@@ -43,11 +59,17 @@ def share(owner: str, name: str, value: Any, *, error: type[MpmoptError] = Scene
 
 
 def count(
-    owner: str, name: str, value: Any, least: int, *, error: type[MpmoptError] = SceneError
+    owner: str,
+    name: str,
+    value: Any,
+    least: int,
+    most: int = MOST,
+    *,
+    error: type[MpmoptError] = SceneError,
 ) -> int:
-    """`value` as a whole number from `least` to `MOST`, or an error."""
+    """`value` as a whole number from `least` to `most`, or an error."""
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
-        raise error(f"{owner}: {name} = {value!r} must be a whole number >= {least}")
-    if not least <= value <= MOST:
-        raise error(f"{owner}: {name} = {value!r:.40} must be from {least} to {MOST:.0e}")
+        raise error(f"{owner}: {name} = {shown(value)} must be a whole number >= {least}")
+    if not least <= value <= most:
+        raise error(f"{owner}: {name} = {shown(value)} must be from {least} to {most:.3g}")
     return int(value)

@@ -6,6 +6,7 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
+from mpmopt.checks import number
 from mpmopt.errors import DesignError
 from mpmopt.mpm import interpolation
 from mpmopt.particles import Particles, lay_out, mirror_images
@@ -107,9 +108,7 @@ class DesignChain:
     """
 
     def __init__(self, scene: Scene, particles: Particles, beta: float) -> None:
-        if not (np.isfinite(beta) and beta > 0.0):
-            raise DesignError(f"beta = {beta!r} must be finite and above 0")
-        self.beta = float(beta)
+        self.beta = number("DesignChain", "beta", beta, above=0.0, error=DesignError)
         self.filter = filter_matrix(scene, particles)
         self._designed = particles.designed
         self._material = scene.material

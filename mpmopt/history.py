@@ -50,7 +50,7 @@ class Iteration:
         it failed.
     redone : int
         How often the stage's time step was halved for this evaluation.
-    courant, spin, jacobian, stretch : float
+    courant, spin, jacobian, stretch, energy : float
         Its `simulate.Margins`, or not a number if it failed.
     failure : str
         Why the evaluation failed, or empty.
@@ -73,6 +73,7 @@ class Iteration:
     spin: float = np.nan
     jacobian: float = np.nan
     stretch: float = np.nan
+    energy: float = np.nan
     failure: str = ""
 
     @property

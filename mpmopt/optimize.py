@@ -391,7 +391,7 @@ class _StageRun:
         run = self.run
         value, failure = np.nan, ""
         gradient: NDArray[np.float64] = np.full(x.size, np.nan)
-        problem, redone, margins = self.problem, self.problem.redo, Margins(*4 * (np.nan,))
+        problem, redone, margins = self.problem, self.problem.redo, Margins(*5 * (np.nan,))
         time_step = problem.scene.time_step / 2.0**redone
         try:
             evaluation = problem.evaluate(x)
@@ -434,6 +434,7 @@ class _StageRun:
             spin=margins.spin,
             jacobian=margins.jacobian,
             stretch=margins.stretch,
+            energy=margins.energy,
             failure=failure,
         )
         self._record(candidate, gradient)

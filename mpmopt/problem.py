@@ -20,13 +20,13 @@ from mpmopt.errors import DesignError, SimulationError, TornError
 from mpmopt.objective import Objective
 from mpmopt.particles import lay_out, nearest_designed
 from mpmopt.scene import Scene
-from mpmopt.simulate import Margins, Memory, Precision, Simulation
+from mpmopt.simulate import Margins, Memory, Precision, Simulation, check_precision
 
 logger = logging.getLogger(__name__)
 
 # An evaluation that goes beyond these is not trusted (docs: theory, "Step control"); the stretch is
 # over the particles per cell and direction.
-LIMITS = Margins(courant=1.0, spin=0.5, jacobian=0.01, stretch=1.5)
+LIMITS = Margins(courant=1.0, spin=0.5, jacobian=0.01, stretch=1.5, energy=0.05)
 
 
 class Variables(NamedTuple):
@@ -108,7 +108,7 @@ class Problem:
     Raises
     ------
     DesignError
-        If beta, `leave_out` or `redo` makes no sense.
+        If beta, `leave_out`, `redo` or `precision` makes no sense.
     """
 
     def __init__(
@@ -121,7 +121,7 @@ class Problem:
         precision: Precision = "double",
     ) -> None:
         self.scene = scene
-        self.precision: Precision = precision
+        self.precision: Precision = check_precision(precision)
         self._memories: list[Memory] = []
         self.leave_out = share("Problem", "leave_out", leave_out, error=DesignError)
         self.redo = count("Problem", "redo", redo, 0, error=DesignError)
@@ -142,9 +142,10 @@ class Problem:
         sizes = (self._designed,) + 3 * (len(self.scene.actuators),)
         parts = []
         for name, value, size in zip(Variables._fields, (phi, a, theta, b), sizes):
-            if np.size(value) not in (1, size) or np.ndim(value) > 1:
-                raise DesignError(f"{name} has shape {np.shape(value)}, must have {(size,)} or ()")
-            parts.append(np.broadcast_to(_real(name, value), size))
+            array = _real(name, value)
+            if array.size not in (1, size) or array.ndim > 1:
+                raise DesignError(f"{name} has shape {array.shape}, must have {(size,)} or ()")
+            parts.append(np.broadcast_to(array, size))
         return np.concatenate(parts)
 
     def split(self, x: NDArray) -> Variables:
@@ -155,7 +156,7 @@ class Problem:
         DesignError
             If x has another size, or an entry is not finite or outside [-1, 1].
         """
-        x = np.asarray(x)
+        x = _array("x", x)
         x = x if x.dtype == complex else _real("x", x)
         if x.shape != (self.size,):
             raise DesignError(f"x has shape {x.shape}, this problem's variables {(self.size,)}")
@@ -314,23 +315,50 @@ class Problem:
         ):
             if not value <= limit:
                 raise _too_long(simulation, f"{what} reached {value:.3g}, the limit is {limit:.3g}")
-        limit = LIMITS.stretch * self.scene.particles_per_cell
-        if not margins.stretch <= limit:
-            raise TornError(
-                f"solid is stretched {margins.stretch:.3g} times, beyond {limit:.3g} it is torn",
-                simulation.steps,
-                -1,
-                (np.nan, np.nan),
-                f"take more particles per cell (now {self.scene.particles_per_cell}), a stiffer "
-                "body or weaker actuation",
-            )
+        refuse_nonsense(margins, simulation)
+
+
+def refuse_nonsense(margins: Margins, simulation: Simulation) -> None:
+    """A run in which energy appeared from nowhere or solid was torn is an error.
+
+    Raises
+    ------
+    SimulationError
+        If its step is too long; a `TornError` if no step mends it.
+    """
+    if not margins.energy <= LIMITS.energy:
+        raise _too_long(
+            simulation,
+            f"energy that appears from nowhere reached {margins.energy:.3g} of all that was turned "
+            f"over, the limit is {LIMITS.energy:.3g}",
+        )
+    per_cell = simulation.scene.particles_per_cell
+    limit = LIMITS.stretch * per_cell
+    if not margins.stretch <= limit:
+        raise TornError(
+            f"solid is stretched {margins.stretch:.3g} times, beyond {limit:.3g} it is torn",
+            simulation.steps,
+            -1,
+            (np.nan, np.nan),
+            f"take more particles per cell (now {per_cell}), a stiffer body or weaker actuation",
+        )
+
+
+def _array(name: str, value: Any) -> NDArray:
+    if np.ma.is_masked(value):
+        raise DesignError(f"{name} has masked entries, which have no value; fill them")
+    try:
+        return np.asarray(value)
+    except (ValueError, OverflowError) as error:
+        raise DesignError(f"{name} is no array of numbers: {error}") from error
 
 
 def _real(name: str, value: Any) -> NDArray[np.float64]:
-    array = np.asarray(value)
+    array = _array(name, value)
     if not (np.issubdtype(array.dtype, np.floating) or np.issubdtype(array.dtype, np.integer)):
         raise DesignError(f"{name} holds {array.dtype}, must hold real numbers")
-    return array.astype(float)
+    with np.errstate(over="ignore"):  # wider numbers: infinite ones are refused
+        return array.astype(float)
 
 
 def _finite(values: Any, simulation: Simulation) -> Any:

@@ -2,7 +2,7 @@
 
 Layout (version 3)::
 
-    attributes       format, version, digest, leg (the start that goes on), stop_reason; as JSON:
+    attributes       format, version, leg (the start that goes on), stop_reason; as JSON:
                      scene, settings, versions, summary
     history/NAME     one entry per evaluation: objective, beta, greyness, step, ...
     best/            the best of all, with gamma, phi, a, theta, b; attribute stage
@@ -12,7 +12,7 @@ Layout (version 3)::
     stage/           a stage that is under way: what its next step depends on
     drawing/C        which particles of a drawn design are there, with C cells of the scene in one
 
-The digest (SHA-256) is of all names, attributes and numbers.
+A digest (SHA-256) of all bytes stands behind the end of the HDF5 file.
 """
 
 from __future__ import annotations
@@ -40,6 +40,8 @@ from mpmopt.problem import Problem, Variables
 from mpmopt.scene import Scene
 
 FORMAT, VERSION = "mpmopt run", 3
+LARGEST = 10**9  # bytes of a run file
+SEAL = 80  # bytes of the digest at the end
 WHOLE = tuple(f.name for f in dataclasses.fields(Iteration) if f.type == "int")
 COLUMNS = tuple(f.name for f in dataclasses.fields(Iteration) if f.type in ("int", "float"))
 
@@ -160,10 +162,9 @@ def write(
         file.attrs["summary"] = json.dumps(dict(summary or {}))
         for coarsening, there in (drawing or {}).items():
             file.create_dataset(f"drawing/{coarsening}", data=there, dtype="?")
-        file.attrs["digest"] = digest(file)
         file.flush()
         image = file.id.get_file_image()
-    replace_file(Path(path), image)
+    replace_file(Path(path), sealed(image))
 
 
 def _fill(file: h5py.File, run: Optimisation) -> None:
@@ -217,27 +218,31 @@ def _write_stage(group: h5py.Group, state: StageState) -> None:
         group.create_dataset(f"mma/{name}", data=value, dtype="f8")
 
 
-def digest(file: h5py.File) -> str:
-    """SHA-256 of all that an open run file holds, in hexadecimal."""
-    whole = hashlib.sha256()
+def sealed(image: bytes) -> bytes:
+    """The bytes of an HDF5 file and, where HDF5 does not look, their digest."""
+    return image + b"\nmpmopt sha256 %s\n" % hashlib.sha256(image).hexdigest().encode()
 
-    def add(name: str, item: Any) -> None:
-        whole.update(f"{name}\n".encode())
-        for key in sorted(item.attrs):
-            if (name, key) != ("/", "digest"):
-                whole.update(f"{key} = {item.attrs[key]!r}\n".encode())
-        if isinstance(item, h5py.Dataset):
-            whole.update(f"{item.shape} {item.dtype}\n".encode())
-            values = item[()]
-            is_text = h5py.check_string_dtype(item.dtype) is not None
-            whole.update(repr(values.tolist()).encode() if is_text else values.tobytes())
 
-    add("/", file)
-    names: list[str] = []
-    file.visit(names.append)
-    for name in sorted(names):
-        add(name, file[name])
-    return whole.hexdigest()
+def _check_seal(path: Path) -> None:
+    """HDF5 may read a damaged file for ever, so it sees none."""
+    if path.stat().st_size > LARGEST:
+        raise RunFileError(
+            f"{path} has {path.stat().st_size} bytes, more than {LARGEST:.0e}: no run file is so "
+            "large"
+        )
+    content = path.read_bytes()
+    image = content[:-SEAL]
+    found, wanted = sealed(image)[-SEAL:], content[-SEAL:]
+    if not wanted.startswith(b"\nmpmopt sha256 "):
+        raise RunFileError(
+            f"{path} has no digest at its end: it is no run file of version {VERSION} of mpmopt, "
+            "or was cut or changed"
+        )
+    if found != wanted:
+        raise RunFileError(
+            f"{path} is damaged: its content has the digest {found[15:27].decode()}..., its own is "
+            f"{wanted[15:27].decode(errors='replace')}...; take a copy of it"
+        )
 
 
 def versions() -> dict[str, str]:
@@ -267,6 +272,7 @@ def read(path: Path) -> RunFile:
     if not path.is_file():
         raise RunFileError(f"{path} is not there; give the path of a run.h5")
     try:
+        _check_seal(path)
         # Run files are replaced as a whole, so none needs a lock; some file systems have none.
         with h5py.File(path, "r", locking=False) as file:
             return _read(file, path)
@@ -274,23 +280,21 @@ def read(path: Path) -> RunFile:
         if isinstance(error, RunFileError):
             raise
         raise RunFileError(f"{path} is damaged: {error}") from error
-    except (OSError, KeyError, ValueError, TypeError, RuntimeError, AttributeError) as error:
+    except (
+        OSError, LookupError, ValueError, TypeError, RuntimeError, AttributeError, ArithmeticError,
+        MemoryError,
+    ) as error:  # fmt: skip
         raise RunFileError(f"{path} is no run file, or damaged: {error}") from error
 
 
 def _read(file: h5py.File, path: Path) -> RunFile:
+    _refuse_foreign(file, {h5py.h5o.get_info(file.id).addr}, path.stat().st_size)
     if file.attrs.get("format") != FORMAT:
         raise RunFileError(f"{path} is HDF5 but no run file of mpmopt")
     if file.attrs["version"] != VERSION:
         raise RunFileError(
             f"{path} is a run file of version {file.attrs['version']}, this mpmopt reads version "
             f"{VERSION}; its versions: {file.attrs.get('versions')}"
-        )
-    found, wanted = digest(file), str(file.attrs["digest"])
-    if found != wanted:
-        raise RunFileError(
-            f"{path} is damaged: its content has the digest {found[:12]}..., its own is "
-            f"{wanted[:12]}...; take a copy of it"
         )
     settings = json.loads(file.attrs["settings"])
     settings["stages"] = tuple(Stage(**stage) for stage in settings["stages"])
@@ -315,6 +319,48 @@ def _read(file: h5py.File, path: Path) -> RunFile:
         summary=dict(json.loads(file.attrs["summary"])),
         drawing={int(name): item[:] for name, item in file.get("drawing", {}).items()},
     )
+
+
+def _refuse_foreign(group: h5py.Group, seen: set[int], size: int) -> None:
+    """Refuse what no run file holds, before any of it is read: the file may be anybody's.
+
+    All must be in the file itself, under one name, whole, as long as it says, and numbers or text.
+    """
+    _refuse_attributes(group)
+    for name in group:
+        where = f"{group.name.rstrip('/')}/{name}"
+        link = group.get(name, getlink=True)
+        if not isinstance(link, h5py.HardLink):
+            raise ValueError(f"{where} leads elsewhere: {type(link).__name__}")
+        item = group[name]
+        address = h5py.h5o.get_info(item.id).addr
+        if address in seen:
+            raise ValueError(f"{where} has another name too")
+        seen.add(address)
+        if isinstance(item, h5py.Group):
+            _refuse_foreign(item, seen, size)
+            continue
+        if not isinstance(item, h5py.Dataset) or not _is_plain(item.dtype):
+            raise ValueError(f"{where} holds neither numbers nor text")
+        _refuse_attributes(item)
+        stored = item.id.get_create_plist()
+        if stored.get_layout() not in (h5py.h5d.CONTIGUOUS, h5py.h5d.COMPACT):
+            raise ValueError(f"{where} is not stored in one piece")
+        if stored.get_external_count():
+            raise ValueError(f"{where} is stored in another file")
+        if item.nbytes > size:
+            raise ValueError(f"{where} claims {item.nbytes} bytes of a file that has {size}")
+
+
+def _refuse_attributes(item: h5py.Group | h5py.Dataset) -> None:
+    for name in item.attrs:
+        kind = item.attrs.get_id(name)
+        if kind.shape != () or not _is_plain(kind.dtype):
+            raise ValueError(f"attribute {name} of {item.name} is neither one number nor a text")
+
+
+def _is_plain(dtype: np.dtype) -> bool:
+    return h5py.check_string_dtype(dtype) is not None or dtype.kind in "biuf"
 
 
 def _read_history(group: h5py.Group) -> list[Iteration]:
@@ -358,7 +404,7 @@ def _read_candidate(parent: h5py.Group, name: str) -> Candidate | None:
 
 
 def _read_stage(group: h5py.Group) -> StageState:
-    return StageState(
+    state = StageState(
         time_step=float(group.attrs["time_step"]),
         failures=int(group.attrs["failures"]),
         values=_numbers(group, "values"),
@@ -367,6 +413,10 @@ def _read_stage(group: h5py.Group) -> StageState:
         farthest_gradient=_numbers(group, "farthest_gradient"),
         mma={name: item[()] for name, item in group["mma"].items()},
     )
+    farthest = 0 if state.farthest is None else state.farthest.x.size
+    if state.farthest_gradient.size != farthest or (state.gradient.size and not state.values.size):
+        raise ValueError("a stage whose values, gradients and designs do not fit together")
+    return state
 
 
 def _numbers(group: h5py.Group, name: str) -> NDArray[np.float64]:

@@ -5,16 +5,23 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from mpmopt.checks import MOST, count, number
+from mpmopt.checks import MOST, count, number, shown
 from mpmopt.errors import SceneError
 
 MOST_PASSES = 200  # of the design filter
+# Numbers in any one array: 0.8 GB. What a scene would take is known before any of it is taken.
+MOST_NUMBERS = 10**8
+MOST_PER_CELL = 100  # particles, per direction
+MOST_PARTS = 1000  # of the body, and walls
+MOST_TEXT = 10**6  # characters of a scene's JSON
 
 Vector = tuple[float, float]
 
@@ -26,11 +33,11 @@ ROUNDING = 1e-6
 
 def _tuple(owner: str, name: str, value: Any, check: Callable[[Any], Any], length: int) -> tuple:
     try:
-        items = tuple(value)
+        items = tuple(islice(value, length + 1))
     except TypeError:
         items = ()
     if isinstance(value, str) or len(items) != length:
-        raise SceneError(f"{owner}: {name} = {value!r} must have {length} entries")
+        raise SceneError(f"{owner}: {name} = {shown(value)} must have {length} entries")
     return tuple(check(item) for item in items)
 
 
@@ -206,9 +213,11 @@ class Wall(_Checked):
 
     def __post_init__(self) -> None:
         if self.axis not in ("x", "y"):
-            raise SceneError(f'Wall: axis = {self.axis!r} must be "x" or "y"')
+            raise SceneError(f'Wall: axis = {shown(self.axis)} must be "x" or "y"')
         if self.solid_side not in ("below", "above"):
-            raise SceneError(f'Wall: solid_side = {self.solid_side!r} must be "below" or "above"')
+            raise SceneError(
+                f'Wall: solid_side = {shown(self.solid_side)} must be "below" or "above"'
+            )
         self._set(position=number("Wall", "position", self.position))
         if self.friction != "stick":
             friction = number("Wall", 'friction (or "stick")', self.friction)
@@ -234,7 +243,7 @@ class Mirror(_Checked):
 
     def __post_init__(self) -> None:
         if self.axis not in ("x", "y"):
-            raise SceneError(f'Mirror: axis = {self.axis!r} must be "x" or "y"')
+            raise SceneError(f'Mirror: axis = {shown(self.axis)} must be "x" or "y"')
         self._set(position=number("Mirror", "position", self.position))
 
     @property
@@ -315,13 +324,19 @@ class Scene(_Checked):
                 raise SceneError(f"Scene: {name} must be a tuple of {part.__name__} objects")
             if any(type(v) is Region for v in value):
                 raise SceneError("Scene: a Region must be a Design, a Solid or an Actuator")
+            if len(value) > MOST_PARTS:
+                raise SceneError(
+                    f"Scene: {name} has {len(value)} parts, more than {MOST_PARTS}; join some"
+                )
             self._set(**{name: tuple(value)})
         self._set(
             time_step=number("Scene", "time_step", self.time_step, above=0.0),
             steps=count("Scene", "steps", self.steps, 1),
             gravity=_vector("Scene", "gravity", self.gravity),
             direction=_vector("Scene", "direction", self.direction),
-            particles_per_cell=count("Scene", "particles_per_cell", self.particles_per_cell, 1),
+            particles_per_cell=count(
+                "Scene", "particles_per_cell", self.particles_per_cell, 1, MOST_PER_CELL
+            ),
             filter_length=number("Scene", "filter_length", self.filter_length),
             blend_time=number("Scene", "blend_time", self.blend_time),
             filter_weights=_tuple(
@@ -352,6 +367,7 @@ class Scene(_Checked):
                 f"more than {MOST_PASSES}; take a shorter one, or larger w1 and w2"
             )
         self._check_body()
+        self._check_size()
         self._check_walls()
         self._check_mirror()
         self._check_stability()
@@ -415,6 +431,42 @@ class Scene(_Checked):
                         f"Scene: {type(region).__name__} {region.lower} to {region.upper} overlaps "
                         f"{type(other).__name__} {other.lower} to {other.upper}"
                     )
+
+    def _check_size(self) -> None:
+        """Refuse what would take more memory than there is, before any is taken."""
+        corners = [self.lattice(region) for region in self.body]
+        lower, upper = (
+            [side(c[e][k] for c in corners) for k in (0, 1)] for e, side in ((0, min), (1, max))
+        )
+        areas = [(x1 - x0) * (y1 - y0) for (x0, y0), (x1, y1) in corners]
+        particles, actuators = sum(areas), len(self.actuators)
+        nodes = math.prod((b - a) // self.particles_per_cell + 4 for a, b in zip(lower, upper))
+        designed = sum(a for a, region in zip(areas, self.body) if isinstance(region, Design))
+        neighbours = min(designed, self.filter_neighbours)
+        for what, numbers, cure in (
+            (f"{particles} particles", 12 * particles, "larger cells or fewer particles per cell"),
+            (f"a body that spans {nodes} nodes", 4 * nodes, "larger cells or a smaller body"),
+            (
+                f"{actuators} actuators of {particles} particles",
+                actuators * particles,
+                "fewer actuators",
+            ),
+            (
+                f"{self.steps} signals of {actuators} actuators",
+                actuators * self.steps,
+                "fewer steps",
+            ),
+            (
+                f"a filter from {designed} particles to {neighbours} each",
+                designed * neighbours,
+                "a shorter filter_length",
+            ),
+        ):
+            if numbers > MOST_NUMBERS:
+                raise SceneError(
+                    f"Scene: {what} would take {numbers:.3g} numbers in one array, more than "
+                    f"{MOST_NUMBERS:.3g}; take {cure}"
+                )
 
     def _check_walls(self) -> None:
         slack = ROUNDING * self.grid.dx
@@ -556,6 +608,15 @@ class Scene(_Checked):
         cells = self.filter_length / self.grid.dx
         return max(1, round((cells**2 - 0.5) / (2.0 * (w1 + 2.0 * w2))))
 
+    @property
+    def filter_neighbours(self) -> int:
+        """Particles from which the filter takes at most, where all around are designed."""
+        # Weights further away than six standard deviations are left out (`design.NEGLIGIBLE`).
+        _, w1, w2 = self.filter_weights
+        spread = math.sqrt(2.0 * self.filter_passes * (w1 + 2.0 * w2))
+        reach = 2 * math.ceil(min(self.filter_passes, 6.0 * spread) + 3)
+        return (reach * self.particles_per_cell) ** 2
+
     def vary(
         self,
         *,
@@ -622,6 +683,13 @@ class Scene(_Checked):
         SceneError
             If the text is no JSON, keys are unknown or missing, or values do not fit.
         """
+        if not isinstance(text, str):
+            raise SceneError(f"Scene: {shown(text)} is no JSON text")
+        if len(text) > MOST_TEXT:
+            raise SceneError(
+                f"Scene: JSON text has {len(text)} characters, more than {MOST_TEXT}; a scene has "
+                f"{MOST_PARTS} parts at most"
+            )
         try:
             data = json.loads(
                 text, parse_constant=_refuse_constant, object_pairs_hook=_refuse_duplicates
@@ -641,7 +709,7 @@ class Scene(_Checked):
                 item = dict(_object("Region", item))
                 kind = item.pop("kind", None)
                 if not isinstance(kind, str) or kind not in kinds:
-                    raise SceneError(f"Region: kind = {kind!r} must be one of {sorted(kinds)}")
+                    raise SceneError(f"Region: kind = {shown(kind)} must be one of {sorted(kinds)}")
                 regions.append(_build(kinds[kind], item))
             data["body"] = tuple(regions)
         if "walls" in data:
@@ -656,9 +724,8 @@ def _refuse_constant(name: str) -> float:
 def _refuse_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     data = dict(pairs)
     if len(data) < len(pairs):
-        names = [name for name, _ in pairs]
-        twice = sorted({name for name in names if names.count(name) > 1})
-        raise SceneError(f"Scene: keys {twice} are there twice; keep one of each")
+        twice = sorted(name for name, n in Counter(name for name, _ in pairs).items() if n > 1)
+        raise SceneError(f"Scene: keys {shown(twice)} are there twice; keep one of each")
     return data
 
 
@@ -680,7 +747,7 @@ def _build(part: Any, data: Any) -> Any:
     fields = {field.name: field for field in dataclasses.fields(part)}
     unknown = sorted(set(data) - set(fields))
     if unknown:
-        raise SceneError(f"{name}: unknown keys {unknown}; known are {sorted(fields)}")
+        raise SceneError(f"{name}: unknown keys {shown(unknown)}; known are {sorted(fields)}")
     missing = [
         key
         for key, field in fields.items()

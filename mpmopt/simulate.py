@@ -14,9 +14,11 @@ from numpy.typing import DTypeLike, NDArray
 
 from mpmopt import mpm
 from mpmopt.checkpoints import Checkpointing, Checkpoints, Schedule
-from mpmopt.errors import DesignError, SimulationError
+from mpmopt.checks import shown
+from mpmopt.energy import Balance
+from mpmopt.errors import DesignError, SimulationError, StorageError
 from mpmopt.particles import Particles
-from mpmopt.scene import ROUNDING, Scene
+from mpmopt.scene import MOST_NUMBERS, ROUNDING, Scene
 from mpmopt.threads import together
 
 Precision = Literal["double", "single"]
@@ -28,6 +30,13 @@ WORK_PER_CALL = 500_000
 BLOCK, BLOCKS = 400, 64
 # States are looked at for their margins once in so many steps, and at the end.
 WATCH = 16
+
+
+def check_precision(precision: Precision) -> Precision:
+    """`precision`, or a DesignError."""
+    if precision not in ("double", "single"):
+        raise DesignError(f'precision = {shown(precision)} must be "double" or "single"')
+    return precision
 
 
 def world_of(scene: Scene) -> mpm.World:
@@ -79,12 +88,16 @@ class Margins(NamedTuple):
     stretch : float
         Largest singular value of F among particles with half the solid's stiffness or more. Solid
         is torn where it exceeds the particles per cell and direction by far.
+    energy : float
+        Most that energy rose without work, as a share of what the run had to do with
+        (`energy.Balance`). No law of motion allows any.
     """
 
     courant: float = 0.0
     spin: float = 0.0
     jacobian: float = math.inf
     stretch: float = 0.0
+    energy: float = 0.0
 
     def join(self, other: Margins) -> Margins:
         """The margins of two runs, or of two parts of a run, taken together."""
@@ -93,6 +106,7 @@ class Margins(NamedTuple):
             max(self.spin, other.spin),
             min(self.jacobian, other.jacobian),
             max(self.stretch, other.stretch),
+            max(self.energy, other.energy),
         )
 
 
@@ -150,8 +164,7 @@ class Simulation:
         state: NDArray | None = None,
         precision: Precision = "double",
     ) -> None:
-        if precision not in ("double", "single"):
-            raise DesignError(f'precision = {precision!r} must be "double" or "single"')
+        check_precision(precision)
         count = len(particles.position)
         if state is None:
             state = np.zeros((mpm.STATE_SIZE, count))
@@ -241,19 +254,18 @@ class Simulation:
         SimulationError
             As `run`.
         """
-        memory = _Segment(self, 1, Memory())
+        memory = _Segment(self, min(WATCH, self.steps), Memory())
         memory.states[0] = mpm.grouped(self.initial)
-        margins = Margins()
+        watcher = _Watcher(self)
         for first in range(0, self.steps, WATCH):
-            margins = margins.join(self.margins(memory.states[0]))
             last = min(first + WATCH, self.steps)
             memory.advance(first, last)
-            memory.states[0] = memory.states[(last - first) % 2]
-        margins = margins.join(self.margins(memory.states[0]))
-        return mpm.ungrouped(memory.states[0], *self.initial.shape), margins
+            watcher.follow(memory.states, first, last)
+            memory.states[0] = memory.states[last - first]
+        return mpm.ungrouped(memory.states[0], *self.initial.shape), watcher.margins
 
     def margins(self, records: NDArray) -> Margins:
-        """Those of a state, as records of groups of particles (`mpm.grouped`)."""
+        """Those of a state, as records of groups of particles (`mpm.grouped`), but for energy."""
         solid = 0.5 * self.scene.material.lame_mu
         found = mpm.margins(records, self.body, self.world, solid, 0, len(self.body.mass))
         return Margins(*(float(value) for value in found))
@@ -338,20 +350,39 @@ class Simulation:
         schedule = checkpoints.schedule
         segment = _Segment(self, schedule.segment, memory or Memory())
         segment.states[0] = mpm.grouped(self.initial)
-        margins = Margins()
+        watcher = _Watcher(self)
         for index, (first, last) in enumerate(schedule.segments):
             if not schedule.all_stored:
                 state = mpm.ungrouped(segment.states[0], *self.initial.shape)
                 checkpoints.write(index, state=state)
             segment.advance(first, last)
-            for slot in range(-first % WATCH, last - first, WATCH):
-                margins = margins.join(self.margins(segment.states[slot]))
+            watcher.follow(segment.states, first, last)
             if last < schedule.steps:
                 if schedule.all_stored:
                     segment.store(index, checkpoints)
                 segment.states[0] = segment.states[last - first]
-        margins = margins.join(self.margins(segment.states[last - first]))
-        return Forward(self, checkpoints, segment, margins)
+        return Forward(self, checkpoints, segment, watcher.margins)
+
+
+class _Watcher:
+    """What is seen of a run: its margins up to the step that it reached."""
+
+    def __init__(self, simulation: Simulation) -> None:
+        self.simulation, self._seen = simulation, Margins()
+        self._balance = Balance(simulation.body, simulation.world, simulation.signal)
+
+    def follow(self, states: NDArray, first: int, last: int) -> None:
+        """Look at steps `first` to `last`, whose states are in slots 0, 1, ..."""
+        self._balance.follow(states, first, last)
+        slots = [*range(-first % WATCH, last - first, WATCH)]
+        if last == self.simulation.steps:
+            slots.append(last - first)
+        for slot in slots:
+            self._seen = self._seen.join(self.simulation.margins(states[slot]))
+
+    @property
+    def margins(self) -> Margins:
+        return self._seen._replace(energy=self._balance.appeared)
 
 
 class Memory:
@@ -367,7 +398,14 @@ class Memory:
         """An array with any content, in the place of the last one of that name."""
         size = math.prod(shape) * np.dtype(dtype).itemsize
         if name not in self._buffers or self._buffers[name].size < size:
-            self._buffers[name] = np.empty(size, np.uint8)
+            self._buffers.pop(name, None)
+            try:
+                self._buffers[name] = np.empty(size, np.uint8)
+            except MemoryError as error:
+                raise StorageError(
+                    f"no memory for {size} bytes of {name}: {error}; store fewer states "
+                    "(Checkpointing.memory, .every), or simulate fewer particles"
+                ) from error
         return self._buffers[name][:size].view(dtype).reshape(shape)
 
 
@@ -384,7 +422,27 @@ class _Segment:
         self.logs = memory.take("logs", (length, groups, 4), dtype)
         self.grids = np.empty((length, simulation.sheets, 0, mpm.NODE_SIZE), dtype)
         self.recomputed: set[int] = set()  # segments whose windows outgrew their room in the store
-        self.resize(*simulation.room)
+        kept = length * simulation.sheets * simulation.room[0] * mpm.NODE_SIZE
+        self.most = max(MOST_NUMBERS, 4 * kept)
+        self.make_room(*simulation.room, 0)
+
+    def make_room(self, nodes: int, part: int, step: int) -> None:
+        """`resize`, unless that would take far more memory than the run began with."""
+        length, sheets, _, _ = self.grids.shape
+        kept = length * sheets * nodes * mpm.NODE_SIZE
+        shared = max(self.blocks, 2 * 9) * sheets * part * mpm.NODE_SIZE
+        for numbers, most in ((kept, self.most), (shared, MOST_NUMBERS)):
+            if numbers > most:
+                raise SimulationError(
+                    f"particles are spread over {nodes} nodes, those of a block over {part}, which "
+                    f"takes {numbers:.3g} numbers, more than {most:.3g}",
+                    step,
+                    -1,
+                    (math.nan, math.nan),
+                    "let no part of the body fly away: take a smaller time step (now "
+                    f"{self.simulation.scene.time_step:g}), weaker actuation, or a smaller grid",
+                )
+        self.resize(nodes, part)
 
     def resize(self, nodes: int, part: int) -> None:
         """Make room for windows of so many nodes, and so many in a block's, keeping the grids."""
@@ -422,9 +480,9 @@ class _Segment:
             nodes, part = self.grids.shape[2], self.scratch.parts.shape[2]
             window = self.windows[reached % len(self.windows), :, 2:].prod(axis=1)
             if end == mpm.WINDOW_TOO_SMALL:
-                self.resize(int(1.25 * window[-1]), part)
+                self.make_room(int(1.25 * window[-1]), part, first + reached)
             elif end == mpm.PART_TOO_SMALL:
-                self.resize(nodes, int(1.25 * window[:-1].max()))
+                self.make_room(nodes, int(1.25 * window[:-1].max()), first + reached)
             elif end != mpm.DONE:
                 shape = simulation.initial.shape
                 particle = min(particle, shape[1] - 1)

@@ -233,7 +233,7 @@ def test_an_optimisation_records_steps_and_margins():
         assert (item.redone, item.time_step) == (1, scene.time_step / 2)
         again = plain(problem, item.time_step).evaluate(item.x)
         assert again.value == item.objective
-        margins = item.courant, item.spin, item.jacobian, item.stretch
+        margins = tuple(getattr(item, name) for name in Margins._fields)
         assert again.margins == margins
     assert run.problem().scene.time_step == scene.time_step / 2
     assert run.problem().value(run.result.x) == run.result.objective

@@ -144,6 +144,27 @@ def test_a_gradient_at_a_complex_design_is_refused(problem, x):
         problem.value(np.array(["a"] * x.size))
 
 
+@pytest.mark.parametrize("wrong", ["half", None, 64])
+def test_a_precision_that_does_not_exist_is_refused_at_once(scene, wrong):
+    with pytest.raises(DesignError, match='"double" or "single"'):
+        Problem(scene, precision=wrong)
+
+
+@pytest.mark.parametrize("value", [[[1.0], [1.0, 2.0]], 32 * [10**400], {}])
+def test_what_is_no_array_of_numbers_is_refused(problem, value):
+    with pytest.raises(DesignError, match=r"x (is no array|holds object)"):
+        problem.value(value)
+    with pytest.raises(DesignError, match=r"phi (is no array|holds object)"):
+        problem.join(value, 0.0, 0.0, 0.0)
+
+
+def test_masked_entries_have_no_value(problem):
+    hidden = np.ma.masked_less(np.zeros(problem.size), 1.0)
+    with pytest.raises(DesignError, match="x has masked entries"):
+        problem.value(hidden)
+    assert problem.value(np.ma.array(np.zeros(problem.size))) == problem.value(np.zeros(38))
+
+
 def test_pieces_that_hang_on_nothing_are_numbered(problem):
     position = problem.particles.position[problem.particles.designed] * 32  # in spacings
     x, y = position.T

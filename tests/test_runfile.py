@@ -89,8 +89,8 @@ def damaged(path, change, seal=True):
     """A run file that was changed; sealed again, so that its digest does not tell."""
     with h5py.File(path, "r+") as file:
         change(file)
-        if seal:
-            file.attrs["digest"] = runfile.digest(file)
+    if seal:
+        path.write_bytes(runfile.sealed(path.read_bytes()))
     return path
 
 
@@ -131,12 +131,83 @@ def test_a_damaged_run_file_is_refused(path, change):
         lambda f: f["last"].attrs.update(objective=9.0),
         lambda f: f.pop("best"),
         lambda f: f.create_group("new"),
-        lambda f: f.attrs.pop("digest"),
     ],
 )
 def test_whatever_changed_since_it_was_written_is_noticed(path, change):
     with pytest.raises(RunFileError, match=r"run\.h5.*dig"):
         runfile.read(damaged(path, change, seal=False))
+
+
+def test_hdf5_never_sees_a_file_of_which_a_byte_changed(path, monkeypatch):
+    content = path.read_bytes()
+    monkeypatch.setattr(h5py, "File", lambda *_, **__: pytest.fail("it was opened"))
+    for place in range(0, len(content), 997):
+        changed = bytearray(content)
+        changed[place] ^= 1 << (place % 8)
+        path.write_bytes(changed)
+        with pytest.raises(RunFileError, match=r"run\.h5.*digest"):
+            runfile.read(path)
+
+
+def replaced(name, *arguments, **options):
+    def change(file):
+        file.pop(name)
+        file.create_dataset(name, *arguments, **options)
+
+    return change
+
+
+def linked(name, link):
+    def change(file):
+        file.pop(name)
+        file[name] = link
+
+    return change
+
+
+def virtual(file):
+    layout = h5py.VirtualLayout(shape=(3,), dtype="f8")
+    layout[:] = h5py.VirtualSource("elsewhere.h5", "x", shape=(3,))
+    file.pop("last/x")
+    file.create_virtual_dataset("last/x", layout)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (linked("last/x", h5py.SoftLink("/first/x")), "/last/x leads elsewhere: SoftLink"),
+        (linked("last", h5py.ExternalLink("o.h5", "/")), "/last leads elsewhere: ExternalLink"),
+        (lambda f: f.update({"last/again": f["legs"]}), "has another name too"),
+        (replaced("last/x", (3,), h5py.ref_dtype), "/last/x holds neither numbers nor text"),
+        (replaced("last/x", (3,), h5py.vlen_dtype(float)), "neither numbers nor text"),
+        (replaced("last/x", data=np.zeros(3, [("a", "f8")])), "neither numbers nor text"),
+        (replaced("last/x", (10**12,), "f8", chunks=(1024,)), "not stored in one piece"),
+        (replaced("last/x", (10**12,), "f8"), "claims 8000000000000 bytes of a file that has"),
+        (replaced("last/x", (3,), "f8", external=[("/etc/passwd", 0, 24)]), "in another file"),
+        (virtual, "not stored in one piece"),
+        (lambda f: f.attrs.update(scene=np.zeros(9)), "attribute scene of / is neither"),
+        (lambda f: f.attrs.create("leg", f.ref, dtype=h5py.ref_dtype), "attribute leg of / is"),
+        (lambda f: f.attrs.update(settings=100000 * "["), "recursion"),
+        (
+            lambda f: (
+                f.create_group("stage").attrs.update(time_step=1.0, failures=0),
+                f["stage"].update({"values": [], "gradient": [1.0], "farthest_gradient": []}),
+                f["stage"].create_group("mma"),
+            ),
+            "do not fit together",
+        ),
+    ],
+)
+def test_what_no_run_file_holds_is_refused_before_it_is_read(path, change, says):
+    with pytest.raises(RunFileError, match=says):
+        runfile.read(damaged(path, change))
+
+
+def test_a_file_that_is_far_too_large_is_not_read(path):
+    with path.open("r+b") as file:
+        file.truncate(10**13)  # without content
+    with pytest.raises(RunFileError, match="has 10000000000000 bytes, more than 1e"):
+        runfile.read(path)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.9, 0.999])

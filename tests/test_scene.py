@@ -3,12 +3,14 @@
 import dataclasses
 import json
 import math
+from itertools import count
 
 import numpy as np
 import pytest
 from conftest import small_scene
 from walker import CASES, walker
 
+from mpmopt.design import DesignChain
 from mpmopt.errors import SceneError
 from mpmopt.particles import lay_out
 from mpmopt.scene import Actuator, Design, Grid, Material, Region, Scene, Solid, Wall
@@ -103,11 +105,19 @@ C = 1 / 16
         (lambda: small_scene(walls=(Wall("y", 1.5),)), ["1.5", "within [0.0625, 0.9375]"]),
         (lambda: small_scene(walls=(Wall("y", 0.0),)), ["y = 0 ", "nodes behind it"]),
         (lambda: small_scene(steps=10**30), ["from 1 to 1e+08"]),
-        (lambda: small_scene().vary(time_step=1e-320), ["more than 1e+08 steps"]),
+        (lambda: small_scene().vary(time_step=1e-20), ["more than 1e+08 steps"]),
         (lambda: small_scene(time_step=0.1), ["0.1", "0.00988", "stability"]),
         (lambda: small_scene(material=Material(mass_floor=1e-4)), ["0.004", "0.0031"]),
         (lambda: small_scene(material=Material(lame_mu=4.0)), ["lame_mu = 4", "-4"]),
         (lambda: small_scene(particles_per_cell=0), ["0", "from 1 to"]),
+        (lambda: small_scene(particles_per_cell=101), ["101", "from 1 to 100"]),
+        (lambda: small_scene(time_step=10**5000), ["a int must be finite"]),
+        (lambda: small_scene(steps=10**5000), ["a int must be from 1"]),
+        (lambda: small_scene(time_step=1e-31), ["1e-31", "from 1e-30 to 1e+30"]),
+        (lambda: small_scene(gravity=(0.0, -1e31)), ["-1e+31", "from 1e-30 to 1e+30"]),
+        (lambda: small_scene(direction=1000 * [0.0]), ["0.0, ", "...", "2 entries"]),
+        (lambda: small_scene(direction=count()), ["2 entries"]),
+        (lambda: small_scene(walls=1001 * (Wall("y", 4 * C),)), ["1001 parts", "1000"]),
         (lambda: small_scene(grid=16), ["Grid"]),
         (lambda: small_scene(body=(1,)), ["Region"]),
     ],
@@ -145,6 +155,67 @@ def test_a_coarser_scene_is_the_same_body():
         walker(128, 4e-4).vary(coarsening=3)
 
 
+WIDE = Grid((10**8, 10**8), C)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (
+            {"grid": WIDE, "body": (Solid((C, C), (1e5 * C + C, 1e5 * C + C)),), "walls": ()},
+            ["40000000000 particles", "4.8e+11 numbers", "1e+08", "larger cells"],
+        ),
+        (
+            {
+                "grid": WIDE,
+                "body": (
+                    Solid((4 * C, 4 * C), (5 * C, 5 * C)),
+                    Solid((1e6 * C, 1e6 * C), (1e6 * C + C, 1e6 * C + C)),
+                ),
+                "walls": (),
+            },
+            ["spans 1000002000001 nodes", "1e+08", "larger cells"],
+        ),
+        (
+            {"grid": WIDE, "body": (Actuator((4 * C, 4 * C), (5 * C, 5 * C)),), "steps": 10**8},
+            None,  # just as much as there may be
+        ),
+        (
+            {"steps": 10**8},
+            ["100000000 signals of 2 actuators", "2e+08", "fewer steps"],
+        ),
+        (
+            {
+                "grid": WIDE,
+                "body": (
+                    Design((4 * C, 4 * C), (504 * C, 504 * C)),
+                    Solid((504 * C, 4 * C), (505 * C, 5 * C)),
+                ),
+                "filter_length": 5 * C,
+            },
+            ["1000000 particles to", "a shorter filter_length"],
+        ),
+    ],
+)
+def test_a_scene_that_takes_too_much_memory_is_refused_before_it_is_taken(change, says):
+    if says is None:
+        assert small_scene(**change).steps == 10**8
+        return
+    with pytest.raises(SceneError) as error:
+        small_scene(**change)
+    for part in says:
+        assert part in str(error.value)
+
+
+@pytest.mark.parametrize("extent", [8, 16])
+def test_the_filter_is_never_larger_than_what_is_refused(extent):
+    # The estimate bounds the filter's entries per particle from above.
+    scene = walker(64, 8e-4)
+    scene = dataclasses.replace(scene, filter_length=extent / 8 * scene.grid.dx)
+    entries = DesignChain(scene, lay_out(scene), 1.0).filter.nnz
+    assert entries <= scene.filter_neighbours * lay_out(scene).designed.sum()
+
+
 def test_a_scene_cannot_be_changed(scene):
     with pytest.raises(dataclasses.FrozenInstanceError):
         scene.steps = 1
@@ -172,6 +243,14 @@ def test_a_region_that_is_neither_design_nor_solid_nor_actuator_is_refused():
         '{"grid": {"cells": [16, 16], "dx": 1'
         + 400 * "0"
         + '}, "time_step": 1, "steps": 1, "body": []}',
+        "{" + ", ".join(f'"a{k % 20000}": 1' for k in range(40000)) + "}",
+        '{"steps": 1' + 10**6 * " " + "}",
+        '{"time_step": NaN}',
+        '{"time_step": -Infinity}',
+        '{"grid":' * 100000,
+        3,
+        b"{}",
+        None,
     ],
 )
 def test_numbers_and_keys_that_json_allows_but_a_scene_does_not(text):

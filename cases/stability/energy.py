@@ -1,0 +1,138 @@
+"""Energy from nowhere: what a run's balance shows where the method works, and where it does not."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from crawler import crawler
+from exact import Bar
+from walker import walker
+
+from mpmopt.errors import SimulationError
+from mpmopt.particles import lay_out
+from mpmopt.problem import LIMITS, Problem
+from mpmopt.scene import Actuator, Grid, Material, Scene, Solid, Wall
+from mpmopt.simulate import Precision, Simulation
+from stability.actuation import equilibrium_stretch
+from stability.common import Found, Line, at_rest, solid
+from stability.time_step import MOTIONS, block_scene, isolated
+from stability.weak import courant_scene
+
+KICK = 1e-6  # velocity of a perturbation, in wave speeds
+
+
+def resolved(quick: bool) -> Iterator[tuple[str, Simulation]]:
+    """Motions that the method gets right."""
+    precisions: tuple[Precision, ...] = ("double",) if quick else ("double", "single")
+    for precision in precisions:
+        for blend in (0.0, 1e4):
+            bar = Bar(50, 0.5, precision=precision, blend_time=blend)
+            yield f"bar vibrates, blend {blend:g}, {precision}", bar.simulation
+        drop = Scene(
+            Grid((32, 32), 1 / 32), time_step=2e-3, steps=3000, gravity=(0.0, -10.0),
+            body=(Solid((8 / 32, 10 / 32), (16 / 32, 16 / 32)),), walls=(Wall("y", 3 / 32),),
+        )  # fmt: skip
+        for blend in (0.0, 2e-2, 1e3):
+            problem = Problem(replace(drop, blend_time=blend), precision=precision)
+            yield f"block bounces, blend {blend:g}, {precision}", problem.simulation(np.zeros(0))
+        for name, scene in (("walker", walker(64, 8e-4)), ("crawler", crawler(64, 8e-4))):
+            for blend in (0.0, 2e-3):
+                there = replace(scene.vary(mass_floor=1e-2), blend_time=blend)
+                problem = Problem(there, 2.0, precision=precision)
+                phi = np.random.default_rng(1).uniform(-1.0, 1.0, problem.size - 3)
+                x = problem.join(phi, 1.0, -0.3, -0.5)
+                yield f"{name}, grey, blend {blend:g}, {precision}", problem.simulation(x)
+
+
+def block(courant: float, steps: int, kick: float) -> Simulation:
+    """A free block that begins with a small random motion."""
+    scene = block_scene(steps=steps)
+    particles = lay_out(scene)
+    state, speed = at_rest(particles), scene.material.wave_speed
+    noise = np.random.default_rng(1).uniform(-1.0, 1.0, state[2:8].shape)
+    state[2:8] = kick * speed * noise
+    return solid(scene, particles, state, time_step=courant / speed)
+
+
+def particle(motion: str, rate: float, courant: float) -> Simulation:
+    """An isolated particle that starts with |C| = rate c_p / dx."""
+    scene = block_scene(steps=300)
+    one = isolated(scene)
+    state, speed = at_rest(one), scene.material.wave_speed
+    state[4:8, 0] = rate * speed * np.array(MOTIONS[motion]) / np.linalg.norm(MOTIONS[motion])
+    return solid(scene, one, state, time_step=courant / speed)
+
+
+def pushing(strength: float, steps: int) -> Simulation:
+    """An actuator in equilibrium that pushes with so many mu, kicked a little."""
+    scene = Scene(
+        Grid((32, 32), 1.0),
+        time_step=0.3 / Material().wave_speed,
+        steps=steps,
+        body=(Actuator((12.0, 12.0), (20.0, 20.0), stress=((1.0, 0.0), (0.0, 1.0))),),
+    )
+    particles = lay_out(scene)
+    state, f = at_rest(particles), equilibrium_stretch(strength)
+    state[0:2] = 16.0 + f * (state[0:2] - 16.0)
+    state[[8, 11]] = f
+    noise = np.random.default_rng(2).uniform(-1.0, 1.0, (2, state.shape[1]))
+    state[2:4] = KICK * scene.material.wave_speed * noise
+    signal = np.full((steps, 1), -strength * scene.material.lame_mu)
+    return solid(scene, particles, state, signal=signal)
+
+
+def light_void(case: str, seed: int) -> Simulation:
+    """A random design at Courant 0.8 whose void weighs 1e-5 of the solid."""
+    scene = courant_scene(case, 0.8, 64, Material(mass_floor=1e-5, stiffness_floor=1e-5))
+    problem = Problem(scene, 16.0)
+    phi = np.random.default_rng(seed).uniform(-1.0, 1.0, problem.size - 3)
+    return problem.simulation(problem.join(phi, 1.0, -0.3, -0.5))
+
+
+def cases(quick: bool) -> Iterator[tuple[str, str, Simulation]]:
+    """All of them: of which kind, what, and the run."""
+    for name, simulation in resolved(quick):
+        yield "resolved", name, simulation
+    for courant in (0.8, 1.0):
+        yield "resolved", f"free block at Courant {courant:g}", block(courant, 1000, KICK)
+    for courant, steps in ((1.2, 40), (1.25, 20), (1.3, 10)):  # until just before it inverts
+        yield "unstable", f"free block at Courant {courant:g}", block(courant, steps, KICK)
+    for motion, rate in (("spin", 0.1), ("spin", 1.0), ("squeeze", 0.1), ("shear", 1.0)):
+        for courant in (0.2, 0.4, 0.6, 0.8):
+            name = f"isolated particle, {motion} at {rate:g} c_p / dx, Courant {courant:g}"
+            yield "isolated particle", name, particle(motion, rate, courant)
+    for strength in (0.9, 0.99):
+        yield "resolved", f"actuator pushes with {strength:g} mu", pushing(strength, 2000)
+    for case in ("walker", "crawler"):
+        for seed in range(1 if quick else 3):
+            yield "light void", f"{case}, light void, design {seed}", light_void(case, seed)
+
+
+def measure(quick: bool) -> Found:
+    """The share of energy that appears in each, and how far both kinds are apart."""
+    rows: list[dict[str, Any]] = []
+    for kind, name, simulation in cases(quick):
+        row: dict[str, Any] = {"kind": kind, "case": name, "courant": np.nan, "spin": np.nan,
+                               "energy": np.nan, "error": ""}  # fmt: skip
+        try:
+            margins = simulation.watch()[1]
+            row |= {key: getattr(margins, key) for key in ("courant", "spin", "energy")}
+        except SimulationError as error:
+            row["error"] = error.what
+        rows.append(row)
+
+    def span(kind: str) -> tuple[float, float]:
+        mine = [row["energy"] for row in rows if row["kind"] == kind and not row["error"]]
+        return min(mine, default=np.nan), max(mine, default=np.nan)
+
+    line = Line(
+        "Energy from nowhere",
+        "none",
+        f"at most {span('resolved')[1]:.0e} of what is turned over in resolved motions, "
+        f"{span('isolated particle')[0]:.0e} to {span('isolated particle')[1]:.1f} for isolated "
+        f"particles in fast motion; {span('unstable')[0]:.0f} to {span('unstable')[1]:.0f} where "
+        f"the step is unstable; beside light void {span('light void')[1]:.0e}: too light to show",
+        f"`Problem` redoes it beyond {LIMITS.energy:g}, then SimulationError.",
+    )
+    return Found({"energy": rows}, [line])
