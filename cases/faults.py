@@ -11,8 +11,10 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import csv
 import dataclasses
 import fcntl
+import io
 import json
 import os
 import random
@@ -325,6 +327,30 @@ def read_only(folder: Path, whole: dict[str, Any]) -> list[Row]:
     return [Row("read-only package and caches", 1, int(same))]
 
 
+def fuzzed(folder: Path, quick: bool) -> list[Row]:
+    """Any scenes, designs and run files run or are refused by name, with bounds checking too."""
+    rows = []
+    modes = {"": 1, "NUMBA_BOUNDSCHECK": 1, "NUMBA_DISABLE_JIT": 4}  # where less is done
+    for mode, share in modes.items():
+        share *= 20 if quick else 1
+        counts = {"scenes": 2000, "designs": 500, "files": 500}
+        options = [f"--{name}={number // share}" for name, number in counts.items()]
+        cache = {"NUMBA_CACHE_DIR": str(folder / mode)} if mode else {}
+        found = folder / f"fuzz{mode}.json"
+        subprocess.run(
+            [sys.executable, str(Path(__file__).with_name("fuzz.py")), *options, f"--json={found}"],
+            env={**os.environ, **cache, **({mode: "1"} if mode else {})}, check=False,
+            stdout=sys.stderr,
+        )  # fmt: skip
+        named = f", {mode}" if mode else ""
+        for row in json.loads(found.read_text()):
+            remark = f"{row['ran']} ran; {row['refused']} refused"
+            good = row["tried"] - len(row["failures"])
+            rows.append(Row(f"any {row['what']}{named}", row["tried"], good, remark))
+        show(f"fuzzing{named}")
+    return rows
+
+
 def show(text: str) -> None:
     """A line of progress."""
     print(f"  {text}", file=sys.stderr, flush=True)
@@ -342,13 +368,17 @@ def campaign(folder: Path, quick: bool) -> list[Row]:
     rows += scratch(folder, whole)
     rows += company(folder, whole)
     rows += read_only(folder, whole)
+    rows += fuzzed(folder, quick)
     return rows
 
 
 def as_csv(rows: list[Row]) -> str:
     """The table."""
-    lines = [",".join(map(str, dataclasses.astuple(row))) for row in rows]
-    return "\n".join(["fault,done,survived,remark", *lines]) + "\n"
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(field.name for field in dataclasses.fields(Row))
+    writer.writerows(dataclasses.astuple(row) for row in rows)
+    return text.getvalue()
 
 
 def main(argv: list[str] | None = None) -> int:
