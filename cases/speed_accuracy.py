@@ -1,12 +1,14 @@
 """Time against error: which discretisation a bar, a walker and a crawler need.
 
-    python cases/speed_accuracy.py --out DIR [--quick] [--peers]
+    python cases/speed_accuracy.py --out DIR [--quick] [--peers] [--scheduler ADDRESS]
 
 Sweeps cells, Courant number, particles per cell, precision, checkpoints and transfer. The bar has
 an exact answer; walker and crawler are designs given as functions of position, so that every
 resolution sees the same robot, and are compared with the finest that is affordable. Writes
-``speed_accuracy.csv``, ``.h5`` and ``.png``, and the tables of the documentation. `--peers` adds
-Taichi in both precisions and Warp at the paper's setting.
+``speed_accuracy.csv``, ``.h5`` and ``.png``, and the tables of the documentation. What
+``speed_accuracy_points.h5`` holds already is not measured again. `--peers` adds Taichi in both
+precisions and Warp at the paper's setting. The workers of a cluster must be alike, and each have a
+processor of its own: what counts is their processor time.
 """
 
 import argparse
@@ -19,9 +21,11 @@ import math
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import crawler
 import h5py
@@ -36,6 +40,7 @@ from mpmopt.discretisation import Discretisation, Measured, density, measure, ti
 from mpmopt.errors import MpmoptError
 from mpmopt.problem import Problem
 from mpmopt.scene import Scene
+from mpmopt.sweeps import connected, results, sweep
 
 BETA = 8.0
 PATCH = 1 / 32  # gradients are compared as sums over squares of this width
@@ -176,7 +181,7 @@ class Point:
         }  # fmt: skip
 
 
-def sweep(quick: bool) -> list[tuple[int, float, Choice]]:
+def settings(quick: bool) -> list[tuple[int, float, Choice]]:
     """Cells, Courant number and choice of all points."""
     smallest = {32: 0.1, 64: 0.1} if quick else {32: 0.05, 64: 0.05, 128: 0.05, 256: 0.2}
     points = [
@@ -203,7 +208,7 @@ REFERENCE, QUICK_REFERENCE = (384, 0.6, PLAIN), (128, 0.6, PLAIN)
 SHORT = 1.0  # seconds; what takes less is measured twice
 
 
-def measure_bar(n: int, courant: float, choice: Choice, repeats: int) -> Measured:
+def measure_bar(n: int, courant: float, choice: Choice) -> Measured:
     """The bar in one discretisation."""
     bar = Bar(
         n, courant, choice.per_cell, Checkpointing(memory=choice.memory), choice.blend_time,
@@ -213,15 +218,15 @@ def measure_bar(n: int, courant: float, choice: Choice, repeats: int) -> Measure
     here = replace(Discretisation.of(scene), precision=choice.precision)
     try:
         bar.value_and_gradient()  # kernels are compiled then
-        (travel, gradient), seconds = timed(bar.value_and_gradient, repeats)
+        (travel, gradient), seconds = timed(bar.value_and_gradient)
     except MpmoptError as error:
         return Measured(here, failure=str(error))
     return Measured(here, seconds, math.nan, travel, gradient)
 
 
-def measure_robot(name: str, n: int, courant: float, choice: Choice, repeats: int) -> Measured:
+def measure_robot(name: str, scene: Scene, n: int, courant: float, choice: Choice) -> Measured:
     """A robot in one discretisation."""
-    scene, phi = ROBOTS[name]
+    _, phi = ROBOTS[name]
     scene = replace(scene, blend_time=choice.blend_time)
     here = Discretisation.of(
         scene, n / scene.grid.cells[0], courant,
@@ -229,38 +234,72 @@ def measure_robot(name: str, n: int, courant: float, choice: Choice, repeats: in
     )  # fmt: skip
     return measure(
         scene, here, design(phi), BETA, PATCH,
-        checkpointing=Checkpointing(memory=choice.memory), repeats=repeats,
+        checkpointing=Checkpointing(memory=choice.memory),
     )  # fmt: skip
 
 
-def run(points: Iterable[tuple[str, int, float, Choice]], rounds: int) -> list[Point]:
-    """Measure all points, in turns over the rounds; the fewest seconds count."""
-    points = list(points)
-    best: dict[tuple[str, int, float, Choice], Measured] = {}
-    for number in range(rounds):
-        for point in points:
-            earlier = best.get(point)
-            if earlier is not None and not earlier.seconds < SHORT:
-                continue
-            name, n, courant, choice = point
-            if name == "bar":
-                measured = measure_bar(n, courant, choice, 1)
-            else:
-                measured = measure_robot(name, n, courant, choice, 1)
-            if earlier is not None:
-                measured = replace(measured, seconds=min(measured.seconds, earlier.seconds))
-            best[point] = measured
-            if number == 0:
-                print(
-                    f"{name} n = {n}, Courant {courant:g}, {choice.name}: "
-                    + (measured.failure or f"{measured.seconds:.2f} s, {measured.travel:.5f}"),
-                    file=sys.stderr, flush=True,
-                )  # fmt: skip
-    return [
-        Point(name, n, best[key].discretisation.steps, courant, choice.name, best[key])
-        for key in points
-        for name, n, courant, choice in [key]
-    ]
+def measure_point(
+    name: str, scene: str, n: int, courant: float, choice: dict[str, Any], round: int
+) -> dict[str, Any]:
+    """The bar, or a robot of a scene, in one discretisation; a round is one more measurement."""
+    measured = (
+        measure_bar(n, courant, Choice(**choice))
+        if name == "bar"
+        else measure_robot(name, Scene.from_json(scene), n, courant, Choice(**choice))
+    )
+    return {
+        "steps": measured.discretisation.steps, "seconds": measured.seconds,
+        "megabytes": measured.megabytes, "travel": measured.travel,
+        "gradient": measured.gradient, "failure": measured.failure,
+    }  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Bench:
+    """Where points are measured and kept.
+
+    Attributes
+    ----------
+    store : Path
+    executor : Executor or None
+        None: one process of this machine, as two at a time would slow each other down.
+    """
+
+    store: Path
+    executor: Executor | None = None
+
+    def measure(
+        self,
+        points: Sequence[tuple[str, int, float, Choice]],
+        scenes: Sequence[Scene] | None = None,
+        number: int = 0,
+    ) -> list[Measured]:
+        """All points, once, in the robots' own scenes or in others."""
+        if scenes is None:
+            bar = Bar(32, 0.4).simulation.scene
+            scenes = [bar if name == "bar" else ROBOTS[name][0] for name, *_ in points]
+        wanted = [
+            {"name": name, "scene": scene.to_json(), "n": n, "courant": courant,
+             "choice": asdict(choice), "round": number}
+            for (name, n, courant, choice), scene in zip(points, scenes, strict=True)
+        ]  # fmt: skip
+        outcomes = sweep(measure_point, wanted, self.store, self.executor, workers=1)
+        return [
+            Measured(Discretisation((n, n), row.pop("steps")), **row)
+            for (_, n, _, _), row in zip(points, results(outcomes), strict=True)
+        ]
+
+    def run(self, points: Sequence[tuple[str, int, float, Choice]], rounds: int) -> list[Point]:
+        """Measure all points, in turns over the rounds; the fewest seconds count."""
+        best = self.measure(points)
+        for number in range(1, rounds):
+            again = [k for k, measured in enumerate(best) if measured.seconds < SHORT]
+            for k, later in zip(again, self.measure([points[k] for k in again], None, number)):
+                best[k] = replace(later, seconds=min(best[k].seconds, later.seconds))
+        return [
+            Point(name, n, measured.discretisation.steps, courant, choice.name, measured)
+            for (name, n, courant, choice), measured in zip(points, best, strict=True)
+        ]
 
 
 def front(points: Sequence[Point], error: str) -> list[Point]:
@@ -326,23 +365,26 @@ def print_peer(name: str, robot: str) -> None:
     )
 
 
-def horizons() -> list[dict[str, str]]:
+def horizons(bench: Bench) -> list[dict[str, str]]:
     """How the gradient's error grows with the simulated time: n = 64 and 128 against 256."""
+    where = [(name, duration) for name in ROBOTS for duration in (0.25, 0.5, 1.0)]
+    cells = (64, 128, 256)
+    measured = iter(
+        bench.measure(
+            [(name, n, 0.6, PLAIN) for name, _ in where for n in cells],
+            [lasting(ROBOTS[name][0], duration) for name, duration in where for _ in cells],
+        )
+    )
     rows = []
-    for name, (scene, phi) in ROBOTS.items():
-        for duration in (0.25, 0.5, 1.0):
-            there = lasting(scene, duration)
-            coarse, middle, fine = (
-                measure(there, Discretisation.of(there, n / 128, 0.6), design(phi), BETA, PATCH)
-                for n in (64, 128, 256)
-            )
-            row = {"robot": name, "seconds simulated": f"{duration:g}"}
-            for n, measured in ((64, coarse), (128, middle)):
-                travel, gradient, angle = measured.errors(fine)
-                row[f"travel, n = {n}"] = f"{travel:.0%}"
-                row[f"gradient, n = {n}"] = f"{gradient:.0%}"
-                row[f"angle, n = {n}"] = f"{angle:.0f}"
-            rows.append(row)
+    for name, duration in where:
+        coarse, middle, fine = (next(measured) for _ in cells)
+        row = {"robot": name, "seconds simulated": f"{duration:g}"}
+        for n, one in ((64, coarse), (128, middle)):
+            travel, gradient, angle = one.errors(fine)
+            row[f"travel, n = {n}"] = f"{travel:.0%}"
+            row[f"gradient, n = {n}"] = f"{gradient:.0%}"
+            row[f"angle, n = {n}"] = f"{angle:.0f}"
+        rows.append(row)
     return rows
 
 
@@ -562,6 +604,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of results")
     parser.add_argument("--quick", action="store_true", help="fewer cells and steps, one round")
     parser.add_argument("--peers", action="store_true", help="Taichi and Warp too")
+    parser.add_argument("--scheduler", metavar="ADDRESS", help="measure on this Dask cluster")
     parser.add_argument("--peer", choices=list(PEERS), help=argparse.SUPPRESS)
     parser.add_argument("--robot", choices=list(ROBOTS), help=argparse.SUPPRESS)
     arguments = parser.parse_args(argv)
@@ -569,21 +612,32 @@ def main(argv: Sequence[str] | None = None) -> int:
         print_peer(arguments.peer, arguments.robot)
         return 0
     arguments.out.mkdir(parents=True, exist_ok=True)
-    path = arguments.out / "speed_accuracy"
     os.environ.setdefault("MPMOPT_THREADS", "1")
-    wanted = sweep(arguments.quick)
-    reference = QUICK_REFERENCE if arguments.quick else REFERENCE
-    rounds = 1 if arguments.quick else 2
-    points = run([(name, *point) for name in TITLES for point in wanted], rounds)
+    try:
+        with connected(arguments.scheduler) as executor:
+            bench = Bench(arguments.out / "speed_accuracy_points.h5", executor)
+            chart(arguments.out / "speed_accuracy", bench, arguments.quick, arguments.peers)
+    except MpmoptError as error:
+        print(f"{type(error).__name__}: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+def chart(path: Path, bench: Bench, quick: bool, peers: bool) -> None:
+    """Measure all points, and write tables and figure to names that begin with a path."""
+    wanted = settings(quick)
+    reference = QUICK_REFERENCE if quick else REFERENCE
+    rounds = 1 if quick else 2
+    points = bench.run([(name, *point) for name in TITLES for point in wanted], rounds)
     references, known = {"bar": exact_bar()}, {"bar": (0.0, 0.0)}
+    references |= dict(zip(ROBOTS, bench.measure([(name, *reference) for name in ROBOTS])))
     for name in ROBOTS:
-        references[name] = run([(name, *reference)], 1)[0].measured
         same = (
             p for p in points if (p.scene, p.courant, p.choice) == (name, reference[1], PLAIN.name)
         )
         travel, gradient, _ = max(same, key=lambda p: p.n).measured.errors(references[name])
         known[name] = travel, gradient
-    if arguments.peers:
+    if peers:
         points += [peer_point(name, robot) for robot in ROBOTS for name in PEERS]
     points = [p.against(references[p.scene]) for p in points]
     write_csv(Path(f"{path}.csv"), [p.row() for p in points])
@@ -592,15 +646,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         p for name in TITLES for p in front([q for q in points if q.scene == name], "travel_error")
     ]
     write_csv(Path(f"{path}_front.csv"), [p.row() for p in best])
-    if not arguments.quick:
-        write_csv(Path(f"{path}_horizon.csv"), horizons())
+    if not quick:
+        write_csv(Path(f"{path}_horizon.csv"), horizons(bench))
         write_csv(Path(f"{path}_manufactured.csv"), manufactured())
     write_h5(Path(f"{path}.h5"), points, references)
     draw(Path(f"{path}.png"), points, known)
     print(machine())
     for name, (travel, gradient) in known.items():
         print(f"{name}: reference known to {travel:.1%} of travel, {gradient:.0%} of the gradient")
-    return 0
 
 
 def exact_bar() -> Measured:

@@ -1,9 +1,9 @@
 """Where the method fails: every failure mode, its limit in theory, as measured, and what happens.
 
-    python cases/stability_map.py --out DIR [--quick]
+    python cases/stability_map.py --out DIR [--quick] [--scheduler ADDRESS]
 
 Writes ``stability_*.csv``, one table for each map, ``stability.rst``, which sums them up, and
-``stability_map.png``.
+``stability_map.png``. What ``stability.h5`` holds already is not measured again.
 """
 
 import argparse
@@ -14,8 +14,8 @@ import logging
 import os
 import platform
 import sys
-import time
 from collections.abc import Sequence
+from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any
 
@@ -36,12 +36,15 @@ from stability import (
 )
 from stability.common import Found
 
-from mpmopt.runfile import replace_file
+from mpmopt.errors import MpmoptError
+from mpmopt.files import replace_file
+from mpmopt.sweeps import connected, results, sweep
 
-MODULES = (
-    time_step, weak, adversary, actuation, inversion, fracture, contact, energy, safe, gradients,
-    optimiser,
-)  # fmt: skip
+MODULES = {
+    "time_step": time_step, "weak": weak, "adversary": adversary, "actuation": actuation,
+    "inversion": inversion, "fracture": fracture, "contact": contact, "energy": energy,
+    "safe": safe, "gradients": gradients, "optimiser": optimiser,
+}  # fmt: skip
 
 
 def as_csv(rows: Sequence[dict[str, Any]]) -> str:
@@ -54,18 +57,31 @@ def as_csv(rows: Sequence[dict[str, Any]]) -> str:
     return text.getvalue()
 
 
-def measure(quick: bool) -> Found:
-    """All modules, with a line of progress for each."""
+def one(module: str, function: str, arguments: dict[str, Any]) -> dict[str, Any]:
+    """One row of one map."""
+    logging.getLogger("mpmopt").setLevel(logging.ERROR)  # failed evaluations are the point
+    return getattr(MODULES[module], function)(**arguments)
+
+
+def measure(quick: bool, store: Path, executor: Executor | None = None) -> Found:
+    """The points of all modules in one sweep, and what each module makes of its own."""
+    points = [
+        {"module": name, "function": function.__name__, "arguments": arguments}
+        for name, module in MODULES.items()
+        for function, rows in module.points(quick).items()
+        for arguments in rows
+    ]
+    rows = iter(results(sweep(one, points, store, executor)))
     found = Found()
-    for number, module in enumerate(MODULES, 1):
-        name = module.__name__.split(".")[-1]
-        print(f"{number} of {len(MODULES)}, {name} ...", end=" ", flush=True)
-        began, worked = time.perf_counter(), time.process_time()
-        part = module.measure(quick)
+    for module in MODULES.values():
+        part = module.measure(
+            {
+                function: [next(rows) for _ in arguments]
+                for function, arguments in module.points(quick).items()
+            }
+        )
         found.tables |= part.tables
         found.lines += part.lines
-        took, worked = time.perf_counter() - began, time.process_time() - worked
-        print(f"{took:.0f} s, {worked:.0f} s of them at work", flush=True)
     return found
 
 
@@ -88,10 +104,15 @@ def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of results")
     parser.add_argument("--quick", action="store_true", help="fewer points, within three minutes")
+    parser.add_argument("--scheduler", metavar="ADDRESS", help="measure on this Dask cluster")
     arguments = parser.parse_args(argv)
-    logging.getLogger("mpmopt").setLevel(logging.ERROR)  # failed evaluations are the point
     arguments.out.mkdir(parents=True, exist_ok=True)
-    found = measure(arguments.quick)
+    try:
+        with connected(arguments.scheduler) as executor:
+            found = measure(arguments.quick, arguments.out / "stability.h5", executor)
+    except MpmoptError as error:
+        print(f"{type(error).__name__}: {error}", file=sys.stderr)
+        return 1
     for name, rows in found.tables.items():
         replace_file(arguments.out / f"stability_{name}.csv", as_csv(rows).encode())
     text = summary(found, arguments.quick)

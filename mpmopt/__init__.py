@@ -7,9 +7,9 @@ __version__ = "0.1.0"
 
 _MODULES = (
     "actuation", "audit", "binary", "case", "checkpoints", "design", "discretisation", "draw",
-    "errors", "film", "files", "history", "interrupt", "mma", "motion", "mpm", "objective",
-    "optimize", "particles", "plot", "problem", "progress", "runfile", "scene", "schematic",
-    "simulate", "verify",
+    "errors", "files", "film", "history", "interrupt", "mma", "motion", "mpm", "multistart",
+    "objective", "optimize", "particles", "plot", "problem", "progress", "runfile", "scene",
+    "schematic", "simulate", "sweeps", "verify",
 )  # fmt: skip
 
 
@@ -17,6 +17,8 @@ def __getattr__(name: str) -> Any:
     """Import a module when it is first used, so that ``import mpmopt`` costs nothing."""
     if name == "cheapest":
         return import_module("mpmopt.discretisation").cheapest
+    if name == "sweep":
+        return import_module("mpmopt.sweeps").sweep
     if name in _MODULES:
         return import_module(f"mpmopt.{name}")
     raise AttributeError(f"module 'mpmopt' has no attribute {name!r}")

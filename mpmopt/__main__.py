@@ -173,7 +173,7 @@ def resume(path: Path) -> int:
     """Go on with a run that was stopped; the exit code says how that ended."""
     from mpmopt import case
 
-    return case.reported(lambda: case.resume(path), path)
+    return case.reported(lambda: case.table(case.resume(path)), case.how_to_go_on(path))
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -135,7 +135,11 @@ class ProgressBar:
 
 
 def run(
-    case: Case, out: Path, checkpointing: Checkpointing | None = None, force: bool = False
+    case: Case,
+    out: Path,
+    checkpointing: Checkpointing | None = None,
+    force: bool = False,
+    phi: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None,
 ) -> dict[str, Any]:
     """Optimise a case and leave its results in a folder.
 
@@ -151,6 +155,8 @@ def run(
     checkpointing : Checkpointing, optional
     force : bool, optional
         Begin anew and replace whatever the folder holds under those names.
+    phi : callable, optional
+        Of positions (D, 2): phi (D,) that a run begins with. By default it is zero.
 
     Returns
     -------
@@ -185,7 +191,9 @@ def run(
         first = case.settings.stages[0]
         problem = Problem(first.scene(case.scene), first.beta)
         turns = QUARTER_TURNS if case.settings.scouting else (0.0,)
-        starts = [problem.join(**{**START, "theta": START["theta"] + turn}) for turn in turns]
+        position = problem.particles.position[problem.particles.designed]
+        plain = START if phi is None else {**START, "phi": phi(position)}
+        starts = [problem.join(**{**plain, "theta": START["theta"] + turn}) for turn in turns]
         begun = begin(case.scene, case.settings, starts)
         runfile.write(path, begun, drawing=drawn(case))
         return _go_on(path, runfile.read(path), checkpointing)
@@ -349,7 +357,8 @@ def main(description: str, cases: Mapping[str, Case], argv: list[str] | None = N
         help="folder of results; an unfinished run in it is gone on with",
     )
     parser.add_argument("--force", action="store_true", help="begin anew, replace earlier results")
-    choice = parser.add_mutually_exclusive_group()
+    # An empty group breaks the help of argparse.
+    choice = parser.add_mutually_exclusive_group() if len(cases) > 1 else parser
     for name, case in cases.items():
         if name != "default":
             n, dt = case.scene.grid.cells[0], case.scene.time_step
@@ -357,20 +366,40 @@ def main(description: str, cases: Mapping[str, Case], argv: list[str] | None = N
             choice.add_argument(
                 f"--{name}", dest="setting", action="store_const", const=name, help=text
             )
+    parser.add_argument(
+        "--starts", type=int, metavar="N", help="optimise from N starts, all but one random"
+    )
+    parser.add_argument(
+        "--scheduler", metavar="ADDRESS", help="run the starts on this Dask cluster"
+    )
     arguments = parser.parse_args(argv)
     logging.basicConfig(format="%(message)s")
-    setting = getattr(arguments, "setting", None) or "default"
+    case = cases[getattr(arguments, "setting", None) or "default"]
+    out, force = arguments.out, arguments.force
+    if arguments.starts is None:
+        if arguments.scheduler:
+            parser.error("--scheduler is for --starts: one run is one process")
+        return reported(lambda: table(run(case, out, force=force)), how_to_go_on(out / "run.h5"))
+    if arguments.starts < 1:
+        parser.error(f"--starts {arguments.starts}: at least 1")
+    from mpmopt.multistart import multistart
+
     return reported(
-        lambda: run(cases[setting], arguments.out, force=arguments.force), arguments.out / "run.h5"
+        lambda: multistart(case, out, arguments.starts, arguments.scheduler, force),
+        "Every evaluation is saved; the same command goes on.",
     )
 
 
-def reported(work: Callable[[], Mapping[str, Any]], path: Path) -> int:
-    """Print the summary that some work on a run file ends with, or why it ended; the exit code."""
-    advice = f"Every evaluation is saved; go on with: python -m mpmopt resume {path}"
+def how_to_go_on(path: Path) -> str:
+    """Advice to someone whose run was interrupted."""
+    return f"Every evaluation is saved; go on with: python -m mpmopt resume {path}"
+
+
+def reported(work: Callable[[], str], advice: str) -> int:
+    """Print the text that some work ends with, or why it ended and an advice; the exit code."""
     try:
         with interruptible(advice):
-            print(table(work()))
+            print(work())
     except MpmoptError as error:
         print(f"{type(error).__name__}: {error}", file=sys.stderr)
         return 1

@@ -55,3 +55,7 @@ class RunFileError(MpmoptError, ValueError):
 
 class MissingLibraryError(MpmoptError, ImportError):
     """An optional library that something needs and that is not installed."""
+
+
+class SweepError(MpmoptError, RuntimeError):
+    """A sweep that cannot be made, continued or read, or a point of it that failed."""

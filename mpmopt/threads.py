@@ -75,8 +75,11 @@ def threads() -> int:
         raise MpmoptError(f"MPMOPT_THREADS = {wish!r} must be a whole number, at least 1")
     if getattr(config, "DISABLE_JIT", 0):
         return 1
-    if wish:
-        return int(wish)
+    return int(wish) if wish else processors()
+
+
+def processors() -> int:
+    """How many processors there are for this process."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import speed_accuracy
 from exact import Bar
-from speed_accuracy import BETA, PLAIN, ROBOTS, Point, design, front, sweep
+from speed_accuracy import BETA, PLAIN, ROBOTS, Point, design, front, settings
 
 from mpmopt.discretisation import Discretisation, Measured
 from mpmopt.problem import Problem
@@ -83,7 +83,7 @@ def test_the_front_is_a_front():
 
 @pytest.mark.parametrize("quick", [True, False])
 def test_all_points_can_be_laid_out_and_are_measured_once(quick):
-    points = sweep(quick)
+    points = settings(quick)
     assert len(set(points)) == len(points)
     for name, (scene, _) in ROBOTS.items():
         for n, courant, choice in points:
@@ -104,7 +104,7 @@ def test_a_chart_is_left_with_its_tables(tmp_path, monkeypatch, drawn):
         monkeypatch.setitem(ROBOTS, name, (speed_accuracy.lasting(scene, 0.02), phi))
     monkeypatch.setattr(Bar, "duration", 1.0)
     points = [(32, 0.4, PLAIN), (32, 0.8, PLAIN), (64, 0.8, PLAIN)]
-    monkeypatch.setattr(speed_accuracy, "sweep", lambda quick: points)
+    monkeypatch.setattr(speed_accuracy, "settings", lambda quick: points)
     monkeypatch.setattr(speed_accuracy, "QUICK_REFERENCE", (96, 0.8, PLAIN))
     assert speed_accuracy.main(["--quick", "--out", str(tmp_path)]) == 0
     assert ((tmp_path / "speed_accuracy.png").stat().st_size > 10_000) == drawn

@@ -91,17 +91,17 @@ def test_particles_in_fast_motion_live_in_the_safe_region(rng):
 
 
 def test_a_heavy_mass_floor_cures_void_that_is_flung():
-    light = weak.one_square("walker", 0.8, weak.floors(1e-6, heavy=False), range(3))
+    light = weak.one_square("walker", 0.8, 1e-6, heavy=False, designs=3)
     assert light["failed"] > 0
     assert "smaller time step" in light["error"]
     assert "higher mass floor" in light["error"]
-    heavy = weak.one_square("walker", 0.8, weak.floors(1e-6, heavy=True), range(3))
+    heavy = weak.one_square("walker", 0.8, 1e-6, heavy=True, designs=3)
     assert (heavy["designs"], heavy["failed"]) == (3, 0)
     assert heavy["largest_deviation"] <= 0.01 * weak.GAIN
 
 
 def test_stiff_light_void_is_refused():
-    row = weak.one_square("crawler", 0.35, weak.floors(1e-1, heavy=True), range(1))
+    row = weak.one_square("crawler", 0.35, 1e-1, heavy=True, designs=1)
     assert row["refused"]
     assert "over the stability limit" in row["error"]
 
@@ -275,7 +275,7 @@ def test_saturated_variables_have_no_slope_left():
 
 
 def test_a_module_becomes_tables_and_a_summary():
-    found = optimiser.measure(quick=True)
+    found = optimiser.measure({})
     text = stability_map.as_csv(found.tables["saturation"])
     rows = list(csv.DictReader(text.splitlines()))
     assert [float(row["beta"]) for row in rows] == list(optimiser.BETAS)
@@ -285,9 +285,8 @@ def test_a_module_becomes_tables_and_a_summary():
 
 
 @pytest.mark.slow
-def test_the_case_writes_a_table_for_each_map_a_summary_and_a_figure(tmp_path, capsys):
+def test_the_case_writes_a_table_for_each_map_a_summary_and_a_figure(tmp_path):
     assert stability_map.main(["--out", str(tmp_path), "--quick"]) == 0
-    assert capsys.readouterr().out.count(" of them at work\n") == len(stability_map.MODULES)
     names = {path.name for path in tmp_path.iterdir()}
     assert {"stability.rst", "stability_map.png", "stability_weak.csv"} <= names
     assert (tmp_path / "stability_map.png").stat().st_size > 50_000

@@ -16,7 +16,7 @@ from mpmopt.errors import SceneError, SimulationError
 from mpmopt.particles import lay_out
 from mpmopt.problem import Variables
 from mpmopt.scene import Actuator, Grid, Material, Scene
-from stability.common import Found, Line, at_rest, largest, solid, stretch
+from stability.common import Found, Line, Measured, Points, at_rest, largest, solid, stretch
 from stability.safe import STRENGTH
 from stability.weak import courant_scene
 
@@ -57,6 +57,11 @@ def growth_of_a_kick(strength: float, courant: float = 0.3, steps: int = 2000) -
     except SimulationError:
         return np.inf
     return float(np.abs(end[2:4]).max() / np.abs(state[2:4]).max())
+
+
+def kicked(strength: float) -> dict[str, Any]:
+    """The same as a row."""
+    return {"strength": strength, "growth": growth_of_a_kick(strength)}
 
 
 def refused(strength: float) -> str:
@@ -109,20 +114,23 @@ def driven(strength: float, courant: float, bias: float = -1.0) -> dict[str, Any
     return row
 
 
-def measure(quick: bool) -> Found:
-    """Ellipticity, measured by the growth of a kick; and walkers up to that limit."""
-    kicks = [
-        {"strength": s, "growth": growth_of_a_kick(s)}
-        for s in (0.5, 0.9, 0.98, 0.99, 1.0, 1.01, 1.02, 1.05)
-    ]
-    limit = largest(lambda s: growth_of_a_kick(s) < 1.0, 0.5, 1.05, 0.002)
-    first = next(s for s in np.linspace(0.9, 1.1, 201) if refused(s))
+def points(quick: bool) -> Points:
+    """Kicks around the loss of ellipticity, and walkers up to it."""
     walkers = [
-        driven(strength, courant, bias)
+        {"strength": strength, "courant": courant, "bias": bias}
         for bias in (-1.0, 1.0)
         for strength in (STRENGTHS[1::2] if quick else STRENGTHS)
         for courant in (COURANTS[::3] if quick else COURANTS)
     ]
+    kicks = [{"strength": s} for s in (0.5, 0.9, 0.98, 0.99, 1.0, 1.01, 1.02, 1.05)]
+    return {kicked: kicks, driven: walkers}
+
+
+def measure(measured: Measured) -> Found:
+    """Ellipticity, measured by the growth of a kick; and walkers up to that limit."""
+    walkers = measured[driven]
+    limit = largest(lambda s: growth_of_a_kick(s) < 1.0, 0.5, 1.05, 0.002)
+    first = next(s for s in np.linspace(0.9, 1.1, 201) if refused(s))
     ellipticity = Line(
         "Strong actuation: loss of ellipticity",
         "largest signal times actuation stress = mu",
@@ -150,4 +158,6 @@ def measure(quick: bool) -> Found:
         f"{failed} of {len(rest)} strong runs end in a SimulationError; **the others run, and "
         "their distance means nothing**.",
     )
-    return Found({"actuation_kick": kicks, "actuation_walker": walkers}, [ellipticity, walking])
+    return Found(
+        {"actuation_kick": measured[kicked], "actuation_walker": walkers}, [ellipticity, walking]
+    )

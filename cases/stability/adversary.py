@@ -10,7 +10,7 @@ from mpmopt.errors import SimulationError
 from mpmopt.optimize import Settings, Stage, optimise
 from mpmopt.problem import Problem
 from mpmopt.scene import Material
-from stability.common import Found, Line, stretch
+from stability.common import Found, Line, Measured, Points, stretch
 from stability.weak import CASES, HEAVY, SAFE_STIFFNESS, courant_scene
 
 FLOORS = ((HEAVY, SAFE_STIFFNESS), (1e-3, 1e-3), (1e-5, 1e-5))  # of mass and stiffness
@@ -61,18 +61,25 @@ def climb(
     return row
 
 
-def measure(quick: bool) -> Found:
+def points(quick: bool) -> Points:
     """Both cases by floors and Courant numbers; in short, only the safe corner and a bad one."""
     choices = [(FLOORS[0], 0.5), (FLOORS[2], 0.8)]
     if not quick:
         choices = [(floors, courant) for floors in FLOORS for courant in COURANTS]
-    rows = [
-        climb(case, *floors, courant, 6 if quick else 12, redo)
+    climbs = [
+        {"case": case, "mass": mass, "stiffness": stiffness, "courant": courant,
+         "most": 6 if quick else 12, "redo": redo}
         for redo in (0, 2)
         for case in CASES
-        for floors, courant in choices
+        for (mass, stiffness), courant in choices
         if redo == 0 or courant == COURANTS[-1]
-    ]
+    ]  # fmt: skip
+    return {climb: climbs}
+
+
+def measure(measured: Measured) -> Found:
+    """What fails by floors and Courant numbers, and what is left at half the step."""
+    rows = measured[climb]
     lines = []
     for floors in FLOORS:
         both = [row for row in rows if (row["mass_floor"], row["stiffness_floor"]) == floors]

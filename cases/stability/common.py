@@ -13,6 +13,10 @@ from mpmopt.scene import Scene
 from mpmopt.simulate import Simulation
 
 Array = NDArray[np.float64]
+Rows = list[dict[str, Any]]
+# Functions whose calls are a module's rows, with the arguments of each.
+Points = Mapping[Callable[..., dict[str, Any]], Rows]
+Measured = Mapping[Callable[..., dict[str, Any]], Rows]  # what these calls returned
 
 
 class Line(NamedTuple):

@@ -8,7 +8,7 @@ import numpy as np
 from mpmopt.errors import SimulationError
 from mpmopt.particles import lay_out
 from mpmopt.scene import Grid, Material, Scene, Solid, Wall
-from stability.common import Array, Found, Line, at_rest, solid
+from stability.common import Array, Found, Line, Measured, Points, at_rest, solid
 
 DX = 1.0 / 32.0
 STEEP = 0.3  # tan(alpha) of the incline
@@ -120,7 +120,27 @@ RATIOS = (0.0, 0.1, 0.2, 0.3, 0.4, 0.6, 0.8, 1.2, 2.0, 3.0)
 SPEEDS = (0.1, 0.2, 0.5, 1.0, 1.5, 2.0, 3.0, 5.0)
 
 
-def measure(quick: bool) -> Found:
+def on_incline(shape: str, cells: int, ratio: float) -> dict[str, Any]:
+    """A body on the incline, in theory and as measured."""
+    return {
+        "shape": shape, "cells": cells, "ratio": ratio, "theory": theory(shape, ratio),
+        "measured": travelled(shape, ratio * STEEP, cells=cells),
+    }  # fmt: skip
+
+
+def points(quick: bool) -> Points:
+    """Inclines and impacts."""
+    inclines = [
+        {"shape": shape, "cells": cells, "ratio": ratio}
+        for shape in ("block", "disc")
+        for cells in ((32,) if quick else (32, 64, 128))
+        for ratio in (RATIOS[::3] if quick else RATIOS)
+    ]
+    impacts = [{"speed": s, "courant": courant} for s in SPEEDS for courant in (0.14, 0.35)]
+    return {on_incline: inclines, impact: impacts}
+
+
+def measure(measured: Measured) -> Found:
     """Onset and rest, inclines, impacts."""
     found = Found()
     height, free = dropped_block(300)
@@ -138,13 +158,7 @@ def measure(quick: bool) -> Found:
             "Runs: the wall is half a cell soft.",
         )
     )
-    rows = found.tables["incline"] = [
-        {"shape": shape, "cells": cells, "ratio": ratio, "theory": theory(shape, ratio),
-         "measured": travelled(shape, ratio * STEEP, cells=cells)}
-        for shape in ("block", "disc")
-        for cells in ((32,) if quick else (32, 64, 128))
-        for ratio in (RATIOS[::3] if quick else RATIOS)
-    ]  # fmt: skip
+    rows = found.tables["incline"] = measured[on_incline]
 
     def worst(shape: str, low: float, high: float) -> str:
         return ", ".join(
@@ -167,11 +181,9 @@ def measure(quick: bool) -> Found:
         ("rolling disc", "a = 2/3 g sin for tan(alpha) <= 3 mu_f", "disc", 0.34, 9.0,
          "Runs: rolls too fast by a share that falls with the cells."),
     ):  # fmt: skip
-        measured = f"off by at most {worst(shape, low, high)} {unit} with {cells} cells"
-        found.lines.append(Line(f"Contact: {name} on an incline", law, measured, loss))
-    hits = found.tables["impact"] = [
-        impact(speed, courant) for speed in SPEEDS for courant in (0.14, 0.35)
-    ]
+        off = f"off by at most {worst(shape, low, high)} {unit} with {cells} cells"
+        found.lines.append(Line(f"Contact: {name} on an incline", law, off, loss))
+    hits = found.tables["impact"] = measured[impact]
     apart = [
         abs(a["rebound"] - b["rebound"])
         for a, b in zip(hits[::2], hits[1::2], strict=True)

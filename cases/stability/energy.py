@@ -1,7 +1,9 @@
 """Energy from nowhere: what a run's balance shows where the method works, and where it does not."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -15,34 +17,49 @@ from mpmopt.problem import LIMITS, Problem
 from mpmopt.scene import Actuator, Grid, Material, Scene, Solid, Wall
 from mpmopt.simulate import Precision, Simulation
 from stability.actuation import equilibrium_stretch
-from stability.common import Found, Line, at_rest, solid
+from stability.common import Found, Line, Measured, Points, at_rest, solid
 from stability.time_step import MOTIONS, block_scene, isolated
 from stability.weak import courant_scene
 
 KICK = 1e-6  # velocity of a perturbation, in wave speeds
 
+Make = Callable[[], Simulation]
 
-def resolved(quick: bool) -> Iterator[tuple[str, Simulation]]:
+
+def vibrating(blend: float, precision: Precision) -> Simulation:
+    """The bar with an exact answer."""
+    return Bar(50, 0.5, precision=precision, blend_time=blend).simulation
+
+
+def grey(scene: Scene, blend: float, precision: Precision) -> Simulation:
+    """A random grey design of a scene; none if there is nothing to design."""
+    problem = Problem(replace(scene, blend_time=blend), 2.0, precision=precision)
+    if problem.size == 0:
+        return problem.simulation(np.zeros(0))
+    phi = np.random.default_rng(1).uniform(-1.0, 1.0, problem.size - 3)
+    return problem.simulation(problem.join(phi, 1.0, -0.3, -0.5))
+
+
+def resolved(quick: bool) -> Iterator[tuple[str, Make]]:
     """Motions that the method gets right."""
     precisions: tuple[Precision, ...] = ("double",) if quick else ("double", "single")
     for precision in precisions:
         for blend in (0.0, 1e4):
-            bar = Bar(50, 0.5, precision=precision, blend_time=blend)
-            yield f"bar vibrates, blend {blend:g}, {precision}", bar.simulation
+            yield (
+                f"bar vibrates, blend {blend:g}, {precision}",
+                partial(vibrating, blend, precision),
+            )
         drop = Scene(
             Grid((32, 32), 1 / 32), time_step=2e-3, steps=3000, gravity=(0.0, -10.0),
             body=(Solid((8 / 32, 10 / 32), (16 / 32, 16 / 32)),), walls=(Wall("y", 3 / 32),),
         )  # fmt: skip
         for blend in (0.0, 2e-2, 1e3):
-            problem = Problem(replace(drop, blend_time=blend), precision=precision)
-            yield f"block bounces, blend {blend:g}, {precision}", problem.simulation(np.zeros(0))
+            name = f"block bounces, blend {blend:g}, {precision}"
+            yield name, partial(grey, drop, blend, precision)
         for name, scene in (("walker", walker(64, 8e-4)), ("crawler", crawler(64, 8e-4))):
             for blend in (0.0, 2e-3):
-                there = replace(scene.vary(mass_floor=1e-2), blend_time=blend)
-                problem = Problem(there, 2.0, precision=precision)
-                phi = np.random.default_rng(1).uniform(-1.0, 1.0, problem.size - 3)
-                x = problem.join(phi, 1.0, -0.3, -0.5)
-                yield f"{name}, grey, blend {blend:g}, {precision}", problem.simulation(x)
+                make = partial(grey, scene.vary(mass_floor=1e-2), blend, precision)
+                yield f"{name}, grey, blend {blend:g}, {precision}", make
 
 
 def block(courant: float, steps: int, kick: float) -> Simulation:
@@ -90,37 +107,50 @@ def light_void(case: str, seed: int) -> Simulation:
     return problem.simulation(problem.join(phi, 1.0, -0.3, -0.5))
 
 
-def cases(quick: bool) -> Iterator[tuple[str, str, Simulation]]:
-    """All of them: of which kind, what, and the run."""
-    for name, simulation in resolved(quick):
-        yield "resolved", name, simulation
+def cases(quick: bool) -> Iterator[tuple[str, str, Make]]:
+    """All of them: of which kind, what, and what makes the run."""
+    for name, make in resolved(quick):
+        yield "resolved", name, make
     for courant in (0.8, 1.0):
-        yield "resolved", f"free block at Courant {courant:g}", block(courant, 1000, KICK)
+        yield "resolved", f"free block at Courant {courant:g}", partial(block, courant, 1000, KICK)
     for courant, steps in ((1.2, 40), (1.25, 20), (1.3, 10)):  # until just before it inverts
-        yield "unstable", f"free block at Courant {courant:g}", block(courant, steps, KICK)
+        yield "unstable", f"free block at Courant {courant:g}", partial(block, courant, steps, KICK)
     for motion, rate in (("spin", 0.1), ("spin", 1.0), ("squeeze", 0.1), ("shear", 1.0)):
         for courant in (0.2, 0.4, 0.6, 0.8):
             name = f"isolated particle, {motion} at {rate:g} c_p / dx, Courant {courant:g}"
-            yield "isolated particle", name, particle(motion, rate, courant)
+            yield "isolated particle", name, partial(particle, motion, rate, courant)
     for strength in (0.9, 0.99):
-        yield "resolved", f"actuator pushes with {strength:g} mu", pushing(strength, 2000)
+        yield "resolved", f"actuator pushes with {strength:g} mu", partial(pushing, strength, 2000)
     for case in ("walker", "crawler"):
         for seed in range(1 if quick else 3):
-            yield "light void", f"{case}, light void, design {seed}", light_void(case, seed)
+            yield (
+                "light void",
+                f"{case}, light void, design {seed}",
+                partial(light_void, case, seed),
+            )
 
 
-def measure(quick: bool) -> Found:
+def balance(number: int, quick: bool) -> dict[str, Any]:
+    """The share of energy that appears in one case, given by its place."""
+    kind, name, make = next(islice(cases(quick), number, None))
+    row: dict[str, Any] = {"kind": kind, "case": name, "courant": np.nan, "spin": np.nan,
+                           "energy": np.nan, "error": ""}  # fmt: skip
+    try:
+        margins = make().watch()[1]
+        return row | {key: getattr(margins, key) for key in ("courant", "spin", "energy")}
+    except SimulationError as error:
+        return row | {"error": error.what}
+
+
+def points(quick: bool) -> Points:
+    """All cases."""
+    count = sum(1 for _ in cases(quick))
+    return {balance: [{"number": number, "quick": quick} for number in range(count)]}
+
+
+def measure(measured: Measured) -> Found:
     """The share of energy that appears in each, and how far both kinds are apart."""
-    rows: list[dict[str, Any]] = []
-    for kind, name, simulation in cases(quick):
-        row: dict[str, Any] = {"kind": kind, "case": name, "courant": np.nan, "spin": np.nan,
-                               "energy": np.nan, "error": ""}  # fmt: skip
-        try:
-            margins = simulation.watch()[1]
-            row |= {key: getattr(margins, key) for key in ("courant", "spin", "energy")}
-        except SimulationError as error:
-            row["error"] = error.what
-        rows.append(row)
+    rows = measured[balance]
 
     def span(kind: str) -> tuple[float, float]:
         mine = [row["energy"] for row in rows if row["kind"] == kind and not row["error"]]

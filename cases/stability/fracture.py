@@ -1,11 +1,13 @@
 """Particles that lose each other, in a stretched body, or the grid."""
 
+from typing import Any
+
 import numpy as np
 
 from mpmopt.errors import SimulationError
 from mpmopt.particles import lay_out
 from mpmopt.scene import Grid, Material, Scene, Solid
-from stability.common import Array, Found, Line, at_rest, solid, stretch
+from stability.common import Array, Found, Line, Measured, Points, at_rest, solid, stretch
 
 STRETCHES = (1.0 + 1e-6, 1.25, 1.5, 1.75, 2.0, 2.25, 2.5, 3.0, 3.5, 4.0, 5.0, 6.0, 7.0, 8.0)
 SPEEDS = (0.5, 0.75, 1.0, 1.25, 1.5, 2.0)
@@ -127,23 +129,40 @@ def thrown(speed: float, courant: float = 0.3) -> tuple[int, int, str]:
     return -1, expected, ""
 
 
-def measure(quick: bool) -> Found:
-    """Cuts through stretched bars, pulled bars, and blocks that leave the grid."""
-    found = Found()
-    found.tables["fracture_force"] = [
-        {"per_cell": n, "stretch": s, "weakest_cut": weakest_cut(s, n)}
-        for n in (2, 3)
-        for s in STRETCHES
-    ]
-    bars = found.tables["fracture_bar"] = []
-    for n in (2, 3):
-        for speed in SPEEDS:
-            momentum, longest, said_bar = pulled_bar(speed, n)
-            back = bool(np.nanmin(momentum) < -0.5) if not said_bar else False
-            bars.append(
-                {"per_cell": n, "speed": speed, "stretch": longest, "comes_back": back,
-                 "failure": said_bar, "least_momentum": float(np.min(momentum))}
-            )  # fmt: skip
+def cut(per_cell: int, stretch: float) -> dict[str, Any]:
+    """The weakest cut as a row."""
+    return {"per_cell": per_cell, "stretch": stretch, "weakest_cut": weakest_cut(stretch, per_cell)}
+
+
+def bar(per_cell: int, speed: float) -> dict[str, Any]:
+    """Whether a pulled bar comes back."""
+    momentum, longest, said = pulled_bar(speed, per_cell)
+    back = bool(np.nanmin(momentum) < -0.5) if not said else False
+    return {
+        "per_cell": per_cell, "speed": speed, "stretch": longest, "comes_back": back,
+        "failure": said, "least_momentum": float(np.min(momentum)),
+    }  # fmt: skip
+
+
+def flight(speed: float) -> dict[str, Any]:
+    """When a block that leaves the grid is noticed, and when it should be."""
+    noticed, expected, text = thrown(speed)
+    return {"speed": speed, "step": noticed, "expected": expected, "failure": text}
+
+
+def points(quick: bool) -> Points:
+    """Cuts through stretched bars, pulled bars, and blocks that leave the grid: none takes long."""
+    return {
+        cut: [{"per_cell": n, "stretch": s} for n in (2, 3) for s in STRETCHES],
+        bar: [{"per_cell": n, "speed": speed} for n in (2, 3) for speed in SPEEDS],
+        flight: [{"speed": speed} for speed in (0.11, 0.37, 1.01)],
+    }
+
+
+def measure(measured: Measured) -> Found:
+    """Cuts, bars and flights."""
+    bars, flights = measured[bar], measured[flight]
+    found = Found({"fracture_force": measured[cut], "fracture_bar": bars, "leaving": flights})
     torn = {
         n: min(
             (b["speed"] for b in bars if b["per_cell"] == n and not b["comes_back"]), default=np.inf
@@ -162,10 +181,6 @@ def measure(quick: bool) -> Found:
             "times one particle a cell.",
         )
     )
-    flights = found.tables["leaving"] = []
-    for speed in (0.11, 0.37, 1.01):
-        noticed, expected, text = thrown(speed)
-        flights.append({"speed": speed, "step": noticed, "expected": expected, "failure": text})
     found.lines.append(
         Line(
             "Particles that leave the grid",

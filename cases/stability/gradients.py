@@ -10,7 +10,7 @@ from mpmopt.problem import Problem
 from mpmopt.scene import Scene
 from mpmopt.simulate import Precision
 from mpmopt.verify import contact_free
-from stability.common import Array, Found, Line
+from stability.common import Array, Found, Line, Measured, Points
 
 HORIZONS = (25, 50, 100, 200, 400, 800, 1250, 2500, 5000)
 STEPS = 10.0 ** -np.arange(1.0, 7.1, 0.5)  # of the design variables, in which radii are counted
@@ -69,13 +69,19 @@ def at_horizon(steps: int, contact: bool) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def measure(quick: bool) -> Found:
+def points(quick: bool) -> Points:
     """All horizons, with contact and without."""
-    rows = [
-        at_horizon(steps, contact)
+    horizons = [
+        {"steps": steps, "contact": contact}
         for contact in (True, False)
         for steps in (HORIZONS[:7:2] if quick else HORIZONS)
     ]
+    return {at_horizon: horizons}
+
+
+def measure(measured: Measured) -> Found:
+    """What grows with the horizon."""
+    rows = measured[at_horizon]
     lines = []
     for contact in (True, False):
         mine = [r for r in rows if r["contact"] is contact]

@@ -7,7 +7,7 @@ import numpy as np
 from mpmopt.errors import SimulationError
 from mpmopt.particles import lay_out
 from mpmopt.scene import Grid, Material, Scene, Solid
-from stability.common import Array, Found, Line, at_rest, solid
+from stability.common import Array, Found, Line, Measured, Points, at_rest, solid
 
 AMPLITUDES = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.7, 1.0)
 RING = Material(lame_lambda=1000 * 0.3 / (1.3 * 0.4), lame_mu=1000 / 2.6, density=1000.0)
@@ -104,28 +104,33 @@ def vortex_stretch(amplitude: float) -> float:
     return float(shear / 2.0 + np.sqrt(1.0 + (shear / 2.0) ** 2))
 
 
-def vortices(quick: bool) -> list[dict[str, Any]]:
-    """Errors of the vortex over amplitudes, grids and Courant numbers."""
-    rows: list[dict[str, Any]] = []
-    for courant in (0.2,) if quick else (0.2, 0.4):
-        for cells in (24, 48) if quick else (24, 48, 96):
-            for amplitude in AMPLITUDES[1::2] if quick else AMPLITUDES:
-                row: dict[str, Any] = {
-                    "amplitude": amplitude, "stretch": vortex_stretch(amplitude), "cells": cells,
-                    "courant": courant, "error": np.nan, "failure": "",
-                }  # fmt: skip
-                try:
-                    row["error"] = vortex(amplitude, cells, courant=courant)
-                except SimulationError as error:
-                    row["failure"] = str(error)
-                rows.append(row)
-    return rows
+def one_vortex(amplitude: float, cells: int, courant: float) -> dict[str, Any]:
+    """Its error, or why it failed."""
+    row: dict[str, Any] = {
+        "amplitude": amplitude, "stretch": vortex_stretch(amplitude), "cells": cells,
+        "courant": courant, "error": np.nan, "failure": "",
+    }  # fmt: skip
+    try:
+        return row | {"error": vortex(amplitude, cells, courant=courant)}
+    except SimulationError as error:
+        return row | {"failure": str(error)}
 
 
-def measure(quick: bool) -> Found:
+def points(quick: bool) -> Points:
+    """Vortices over amplitudes, grids and Courant numbers."""
+    vortices = [
+        {"amplitude": amplitude, "cells": cells, "courant": courant}
+        for courant in ((0.2,) if quick else (0.2, 0.4))
+        for cells in ((24, 48) if quick else (24, 48, 96))
+        for amplitude in (AMPLITUDES[1::2] if quick else AMPLITUDES)
+    ]
+    return {one_vortex: vortices}
+
+
+def measure(measured: Measured) -> Found:
     """The vortex at a tenth, at one, and between."""
     found = Found()
-    rows = found.tables["vortex"] = vortices(quick)
+    rows = found.tables["vortex"] = measured[one_vortex]
     fine = [r for r in rows if r["amplitude"] == 0.1 and r["courant"] == rows[-1]["courant"]]
     full = [r for r in rows if r["amplitude"] == 1.0]
     silent = [r for r in rows if not r["failure"] and r["error"] > 0.2 and r["stretch"] > 2.0]

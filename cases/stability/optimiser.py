@@ -6,7 +6,7 @@ import numpy as np
 
 from mpmopt.design import project, project_adjoint
 from mpmopt.mma import MMAError, MovingAsymptotes
-from stability.common import Found, Line
+from stability.common import Found, Line, Measured, Points
 
 LEAST_DISTANCES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)
 SCALES = tuple(10.0**k for k in (-12, -9, -6, -3, 3, 6, 9, 12))
@@ -59,8 +59,13 @@ def saturation(beta: float) -> dict[str, Any]:
     }
 
 
-def measure(quick: bool) -> Found:
-    """Cycles, scales, NaN and saturation; nothing here takes long."""
+def points(quick: bool) -> Points:
+    """None: nothing here takes long."""
+    return {}
+
+
+def measure(measured: Measured) -> Found:
+    """Cycles, scales, NaN and saturation."""
     found = Found()
     found.tables["optimiser_cycle"] = [
         {"least_distance": d, "width": cycle(d)} for d in LEAST_DISTANCES

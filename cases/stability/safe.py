@@ -8,7 +8,7 @@ import numpy as np
 from mpmopt.errors import SimulationError
 from mpmopt.problem import Problem
 from mpmopt.scene import Actuator, Material, Scene
-from stability.common import Found, Line, stretch
+from stability.common import Found, Line, Measured, Points, stretch
 from stability.time_step import SAFE_COURANT
 from stability.weak import CASES, actuation, courant_scene
 
@@ -58,15 +58,21 @@ def at_random(case: str, beta: float, seed: int, cells: int = 64) -> dict[str, A
     return row
 
 
-def measure(quick: bool) -> Found:
+def points(quick: bool) -> Points:
     """Many random designs of both cases, grey and nearly black and white."""
-    rows = [
-        at_random(case, beta, seed, cells)
+    designs = [
+        {"case": case, "beta": beta, "seed": seed, "cells": cells}
         for cells in ((64,) if quick else (64, 128))
         for case in CASES
         for beta in BETAS
         for seed in range(3 if quick else 25 if cells == 64 else 5)
     ]
+    return {at_random: designs}
+
+
+def measure(measured: Measured) -> Found:
+    """How many fail, and how far half the step moves the others."""
+    rows = measured[at_random]
     failed = sum(bool(row["error"]) for row in rows)
     change = np.array([abs(row["half_step"] - row["distance"]) for row in rows])
     longest = np.nanmax([row["solid_stretch"] for row in rows])

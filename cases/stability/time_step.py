@@ -1,6 +1,5 @@
 """The time step over its limit: an isolated particle, bulk, free bodies, and fast spin."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -11,7 +10,18 @@ from mpmopt import mpm
 from mpmopt.errors import SceneError, SimulationError
 from mpmopt.particles import Particles, lay_out
 from mpmopt.scene import Grid, Scene, Solid
-from stability.common import Array, Found, Line, at_rest, failure, largest, solid
+from stability.common import (
+    Array,
+    Found,
+    Line,
+    Measured,
+    Points,
+    Rows,
+    at_rest,
+    failure,
+    largest,
+    solid,
+)
 
 CELLS = 24
 # What the documentation calls safe: Courant number, and dt |C|.
@@ -104,44 +114,35 @@ def shifted(particles: Particles, by: float) -> Particles:
     )
 
 
-def resting_limits(quick: bool) -> list[dict[str, Any]]:
-    """Limits of bodies at rest: linear theory beside what a small kick shows."""
-    steps = 1000 if quick else 4000
-    rows: list[dict[str, Any]] = []
+def resting_limit(body: str, steps: int, shift: float = 0.0) -> dict[str, Any]:
+    """Limit of a body at rest: linear theory beside what a small kick shows.
 
-    def add(body: str, theory: float, holds: Callable[[float], bool]) -> None:
-        measured = largest(holds, 0.3, 3.0, 0.005)
-        rows.append({"body": body, "theory": theory, "measured": measured})
-
-    scene = block_scene(steps=steps)
-    one = isolated(scene)
-    ones = np.ones(1)
-    add(
-        "isolated particle",
-        linear_limit(one.position, ones, one.volume / one.volume, 1.0 * ones),
-        lambda c: stays_small(scene, one, ones, c),
-    )
-    for shift in (0.0, 0.25, 0.5) if quick else (0.0, 0.125, 0.25, 0.375, 0.5):
+    Parameters
+    ----------
+    body : {"isolated particle", "free block", "bulk"}
+    steps : int
+        After which a kick must not have grown.
+    shift : float
+        Of a free block against the grid, in cells.
+    """
+    if body == "bulk":
+        # A rim four times as heavy moves slowly and leaves what lies inside to itself.
+        scene = block_scene(14, steps)
+        particles = lay_out(scene)
+        rim = np.any(np.abs(particles.position - CELLS / 2) > 4.0, axis=1)
+        mass = np.where(rim, 4.0, 1.0)
+        patch = lay_out(block_scene(6)).position
+        ones = np.ones(len(patch))
+        theory = linear_limit(patch, ones, ones, ones, period=6)
+    else:
+        scene = block_scene(steps=steps)
         block = shifted(lay_out(scene), shift)
-        ones = np.ones(len(block.position))
-        add(
-            f"free block, {shift:g} cells from the grid",
-            linear_limit(block.position, ones, ones, ones),
-            lambda c, block=block, ones=ones: stays_small(scene, block, ones, c),
-        )
-    # A rim four times as heavy moves slowly and leaves what lies inside to itself.
-    large = block_scene(14, steps)
-    block = lay_out(large)
-    rim = np.any(np.abs(block.position - CELLS / 2) > 4.0, axis=1)
-    mass = np.where(rim, 4.0, 1.0)
-    patch = lay_out(block_scene(6)).position
-    ones = np.ones(len(patch))
-    add(
-        "bulk",
-        linear_limit(patch, ones, ones, ones, period=6),
-        lambda c: stays_small(large, block, mass, c),
-    )
-    return rows
+        particles = isolated(scene) if body == "isolated particle" else block
+        mass = ones = np.ones(len(particles.position))
+        theory = linear_limit(particles.position, ones, ones, ones)
+    measured = largest(lambda c: stays_small(scene, particles, mass, c), 0.3, 3.0, 0.005)
+    name = f"{body}, {shift:g} cells from the grid" if body == "free block" else body
+    return {"body": name, "theory": theory, "measured": measured}
 
 
 MOTIONS = {
@@ -167,23 +168,34 @@ def survives(motion: Array, rate: float, courant: float, steps: int = 3000) -> b
     return not failure(run)
 
 
-def moving_limits(quick: bool) -> list[dict[str, Any]]:
-    """Lowest Courant numbers at which an isolated particle in fast motion inverts."""
-    rows: list[dict[str, Any]] = []
-    courants = np.arange(0.1, 0.9, 0.02 if quick else 0.01)
-    for name, motion in MOTIONS.items():
-        for rate in RATES[::3] if quick else RATES:
-            fails = (c for c in courants if not survives(np.array(motion), rate, c))
-            first = next(fails, np.nan)
-            rows.append(
-                {"motion": name, "rate": rate, "measured": first, "dt_C": float(first * rate)}
-            )
-    return rows
+def moving_limit(motion: str, rate: float, spacing: float) -> dict[str, Any]:
+    """Lowest Courant number, of so many, at which an isolated particle in fast motion inverts."""
+    courants = np.arange(0.1, 0.9, spacing)
+    fails = (c for c in courants if not survives(np.array(MOTIONS[motion]), rate, c))
+    first = float(next(fails, np.nan))
+    return {"motion": motion, "rate": rate, "measured": first, "dt_C": first * rate}
 
 
-def measure(quick: bool) -> Found:
+def points(quick: bool) -> Points:
+    """Bodies at rest, and motions by their rate."""
+    steps = 1000 if quick else 4000
+    shifts = (0.0, 0.25, 0.5) if quick else (0.0, 0.125, 0.25, 0.375, 0.5)
+    rest: Rows = [
+        {"body": "isolated particle", "steps": steps},
+        *({"body": "free block", "steps": steps, "shift": shift} for shift in shifts),
+        {"body": "bulk", "steps": steps},
+    ]
+    motion = [
+        {"motion": name, "rate": rate, "spacing": 0.02 if quick else 0.01}
+        for name in MOTIONS
+        for rate in (RATES[::3] if quick else RATES)
+    ]
+    return {resting_limit: rest, moving_limit: motion}
+
+
+def measure(measured: Measured) -> Found:
     """Limits at rest and in motion, and what a scene says to a step that is too long."""
-    rest, motion = resting_limits(quick), moving_limits(quick)
+    rest, motion = measured[resting_limit], measured[moving_limit]
     scene = block_scene()
     legal, said = scene.largest_time_step, ""
     try:
@@ -196,12 +208,8 @@ def measure(quick: bool) -> Found:
     refused = f"Refused from Courant {legal * scene.material.wave_speed:.3f} on: {said}."
     lines = []
     for body, rows in by_body.items():
-        theory, measured = ([row[key] for row in rows] for key in ("theory", "measured"))
-        lines.append(
-            Line(
-                f"Time step too long: {body}", f"{min(theory):.3f}", f"{min(measured):.3f}", refused
-            )
-        )
+        theory, found = (min(row[key] for row in rows) for key in ("theory", "measured"))
+        lines.append(Line(f"Time step too long: {body}", f"{theory:.3f}", f"{found:.3f}", refused))
     worst = {
         rate: min(r["measured"] for r in motion if r["rate"] == rate)
         for rate in dict.fromkeys(r["rate"] for r in motion)

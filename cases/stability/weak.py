@@ -1,7 +1,6 @@
 """Weak particles beside stressed solid: random designs over Courant number and floors."""
 
 import math
-from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -18,7 +17,7 @@ from mpmopt.particles import lay_out
 from mpmopt.problem import Variables
 from mpmopt.scene import Grid, Material, Scene
 from mpmopt.simulate import Simulation
-from stability.common import Array, Found, Line
+from stability.common import Array, Found, Line, Measured, Points
 from stability.time_step import block_scene, linear_limit
 
 EPSILONS = tuple(10.0**-k for k in range(1, 7))
@@ -99,8 +98,11 @@ def limit_at_rest(material: Material) -> float:
     return min(linear_limit(position + shift, mass, ones, stiffness) for shift in (0.0, 0.25, 0.5))
 
 
-def one_square(case: str, courant: float, material: Material, seeds: range) -> dict[str, Any]:
+def one_square(
+    case: str, courant: float, epsilon: float, heavy: bool, designs: int
+) -> dict[str, Any]:
     """Random designs with void, each against the same body without it."""
+    material = floors(epsilon, heavy)
     row: dict[str, Any] = {
         "case": case, "courant": courant, "stiffness_floor": material.stiffness_floor,
         "mass_floor": material.mass_floor, "refused": False, "designs": 0, "failed": 0,
@@ -112,7 +114,7 @@ def one_square(case: str, courant: float, material: Material, seeds: range) -> d
         return row | {"refused": True, "error": str(error)}
     particles = lay_out(scene)
     away = []
-    for seed in seeds:
+    for seed in range(designs):
         there, variables = patches(particles.position[particles.designed], seed), actuation(seed)
         alone = distance(scene, there, variables)
         row["designs"] += 1
@@ -126,24 +128,23 @@ def one_square(case: str, courant: float, material: Material, seeds: range) -> d
     return row
 
 
-def squares(quick: bool) -> Iterator[dict[str, Any]]:
+def points(quick: bool) -> Points:
     """The map: case by case, floors and Courant numbers."""
-    epsilons = EPSILONS[::2] + EPSILONS[-1:] if quick else EPSILONS
-    courants = COURANTS[2::2] if quick else COURANTS
-    for case in CASES:
-        for heavy in (False, True):
-            for epsilon in epsilons:
-                if heavy and epsilon == HEAVY:  # is among the equal ones
-                    continue
-                for courant in courants:
-                    yield one_square(
-                        case, courant, floors(epsilon, heavy), range(2 if quick else 8)
-                    )
+    squares = [
+        {"case": case, "courant": courant, "epsilon": epsilon, "heavy": heavy,
+         "designs": 2 if quick else 8}
+        for case in CASES
+        for heavy in (False, True)
+        for epsilon in (EPSILONS[::2] + EPSILONS[-1:] if quick else EPSILONS)
+        for courant in (COURANTS[2::2] if quick else COURANTS)
+        if not (heavy and epsilon == HEAVY)  # is among the equal ones
+    ]  # fmt: skip
+    return {one_square: squares}
 
 
-def measure(quick: bool) -> Found:
+def measure(measured: Measured) -> Found:
     """The map, and how it sums up for equal floors and for a heavy mass floor."""
-    rows = list(squares(quick))
+    rows = measured[one_square]
     lines = []
     for heavy in (False, True):
         mine = [r for r in rows if (r["mass_floor"] == HEAVY) is heavy or not heavy]
@@ -157,14 +158,14 @@ def measure(quick: bool) -> Found:
         theory = f"linearised step at rest: {min(at_rest_limits):.2f} to {max(at_rest_limits):.2f}"
         if failed:
             first = min(failed, key=lambda r: (r["courant"], -r["stiffness_floor"]))
-            measured = (
+            said = (
                 f"{sum(r['failed'] for r in failed)} of {runs} runs fail, the first at Courant "
                 f"{first['courant']:g} with floors of {first['stiffness_floor']:.0e}"
             )
         else:
-            measured = f"0 of {runs} runs fail, up to Courant {max(r['courant'] for r in ran):g}"
+            said = f"0 of {runs} runs fail, up to Courant {max(r['courant'] for r in ran):g}"
         weak = [r["largest_deviation"] for r in ran if r["stiffness_floor"] <= SAFE_STIFFNESS]
-        measured += (
+        said += (
             f"; with floors of {SAFE_STIFFNESS:g} or less void moves the objective by at most "
             f"{np.nanmax(weak):.4f}"
         )
@@ -174,6 +175,6 @@ def measure(quick: bool) -> Found:
         if refused:
             program += f" {refused} of {len(mine)} squares are refused: SceneError."
         lines.append(
-            Line(f"Weak particles beside stressed solid, {name}", theory, measured, program.strip())
+            Line(f"Weak particles beside stressed solid, {name}", theory, said, program.strip())
         )
     return Found({"weak": rows}, lines)

@@ -1,0 +1,255 @@
+"""One case from several starts: how far luck carries, and which run is the best."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import dataclasses
+import functools
+import io
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpmopt import runfile
+from mpmopt.binary import Drawing
+from mpmopt.case import Case, run
+from mpmopt.errors import SweepError
+from mpmopt.files import make_folder, replace_file
+from mpmopt.optimize import Settings, Stage
+from mpmopt.scene import Design, Scene
+from mpmopt.sweeps import connected, sweep
+
+AMPLITUDE = 0.3  # standard deviation of a start's phi
+LENGTH = 0.15  # its correlation length, in longest sides of the design domain
+WAVES = 64
+
+
+def random_start(scene: Scene, seed: int) -> Callable[[NDArray], NDArray[np.float64]]:
+    """A smooth random field phi, the same on every grid.
+
+    A sum of plane waves, phi = A sqrt(2 / W) sum_w cos(k_w . x + p_w), with Gaussian k_w and
+    uniform p_w: nearly a Gaussian field with covariance A^2 exp(-r^2 / (2 l^2)) (Shinozuka and
+    Deodatis, Applied Mechanics Reviews 44, 1991, 191), where l is `LENGTH` times the longest side
+    of the design domain and A is `AMPLITUDE`. What is beyond [-1, 1] is cut off.
+
+    Parameters
+    ----------
+    scene : Scene
+    seed : int
+        0 is the plain start, phi = 0 everywhere.
+
+    Returns
+    -------
+    callable
+        From positions (D, 2) to phi (D,).
+    """
+    if seed == 0:
+        return lambda position: np.zeros(len(position))
+    corners = np.array([(r.lower, r.upper) for r in scene.body if isinstance(r, Design)])
+    sides = np.ptp(corners, axis=(0, 1)) if len(corners) else np.ones(2)
+    rng = np.random.default_rng(seed)
+    waves = rng.standard_normal((2, WAVES)) / (LENGTH * sides.max())
+    phase = rng.uniform(0.0, 2.0 * np.pi, WAVES)
+
+    def field(position: NDArray) -> NDArray[np.float64]:
+        total = np.cos(position @ waves + phase).sum(axis=1)
+        return np.clip(AMPLITUDE * math.sqrt(2.0 / WAVES) * total, -1.0, 1.0)
+
+    return field
+
+
+def one_start(
+    scene: str, settings: dict[str, Any], seed: int, *, drawing: Drawing, out: Path, force: bool
+) -> dict[str, float]:
+    """Optimise from one start, in a folder of its own, or go on with what was begun there.
+
+    What `case.run` leaves is in ``out/start-SEED``, and ``log.txt`` with what it said.
+
+    Returns
+    -------
+    dict
+        Numbers of the summary; `gain` is the post-processed design's over the full block, and
+        `audited_gain` what is left of it with half the step or cells half as wide, whichever is
+        less.
+    """
+    stages = tuple(Stage(**stage) for stage in settings["stages"])
+    case = Case(Scene.from_json(scene), Settings(**{**settings, "stages": stages}), drawing)
+    folder = out / f"start-{seed}"
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / "log.txt").open("a", buffering=1) as log, contextlib.redirect_stderr(log):
+        summary = run(case, folder, force=force, phi=random_start(case.scene, seed))
+
+    def number(value: float | None) -> float:
+        return math.nan if value is None else float(value)
+
+    gain = number(summary["post_processed"]) - number(summary["reference"])
+    half, fine = (
+        number(summary["gain_kept"][name]) for name in ("half the step", "cells half as wide")
+    )
+    return {
+        "reference": number(summary["reference"]),
+        "optimised": summary["optimised"],
+        "post_processed": number(summary["post_processed"]),
+        "gain": gain,
+        "kept_half_step": half,
+        "kept_half_cells": fine,
+        "audited_gain": gain * float(np.minimum(1.0, np.minimum(half, fine))),
+        "loose_particles": summary["loose_particles"],
+        "evaluations": summary["evaluations"],
+        "failed_evaluations": summary["failed_evaluations"],
+        "seconds": summary["seconds"],
+    }
+
+
+def multistart(
+    case: Case, out: Path, starts: int, scheduler: str | None = None, force: bool = False
+) -> str:
+    """Optimise a case from several starts, with seeds 0, 1, ... (`random_start`).
+
+    Starts run side by side. Leaves ``start-0``, ``start-1``, ..., one folder for each; the numbers
+    in ``starts.h5`` (`sweeps`) and ``starts.csv``; and ``starts.png``. A start whose numbers are
+    there is not run again; one that was stopped is gone on with.
+
+    Parameters
+    ----------
+    case : Case
+    out : Path
+        Folder; on a cluster one that all workers see under this name.
+    starts : int
+    scheduler : str, optional
+        Address of a Dask cluster (`sweeps.connected`).
+    force : bool, optional
+        Run all starts anew.
+
+    Returns
+    -------
+    str
+        The table, what spread there is, and the best after its audit.
+
+    Raises
+    ------
+    SweepError
+        If no start came to an end.
+    StorageError
+        If the folder cannot be written to.
+    """
+    out = Path(out).absolute()
+    make_folder(out)
+    plan = {"scene": case.scene.to_json(), "settings": dataclasses.asdict(case.settings)}
+    function = functools.partial(one_start, drawing=case.drawing, out=out, force=force)
+    if force:
+        (out / "starts.h5").unlink(missing_ok=True)
+    with connected(scheduler) as executor:
+        outcomes = sweep(
+            function,
+            [{**plan, "seed": seed} for seed in range(starts)],
+            out / "starts.h5",
+            executor,
+        )
+    rows = [
+        {"start": outcome.point["seed"], **outcome.result}
+        for outcome in outcomes
+        if not outcome.error
+    ]
+    failed = "".join(
+        f"start {outcome.point['seed']} failed: {outcome.error.splitlines()[0]}\n"
+        for outcome in outcomes
+        if outcome.error
+    )
+    if not rows:
+        raise SweepError(f"no start came to an end\n{failed}")
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(
+        {k: f"{v:.4g}" if isinstance(v, float) else v for k, v in row.items()} for row in rows
+    )
+    replace_file(out / "starts.csv", text.getvalue().encode())
+    draw(out / "starts.png", out, rows)
+    return failed + report(rows)
+
+
+def best_of(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """The row with the greatest audited gain; one that has none comes last."""
+    return max(rows, key=lambda row: (_finite(row["audited_gain"]), _finite(row["gain"])))
+
+
+def _finite(value: float) -> float:
+    return value if math.isfinite(value) else -math.inf
+
+
+def report(rows: Sequence[dict[str, Any]]) -> str:
+    """The rows as aligned text, their spread, and the best."""
+    columns = {
+        "start": ("start", "d"),
+        "post_processed": ("post-processed", ".3f"),
+        "gain": (" gain", ".3f"),
+        "kept_half_step": ("kept at half step", ".0%"),
+        "kept_half_cells": ("at half cells", ".0%"),
+        "audited_gain": ("audited gain", ".3f"),
+        "loose_particles": ("loose", "d"),
+        "failed_evaluations": ("failed", "d"),
+        "seconds": ("seconds", ".0f"),
+    }
+    lines = ["  ".join(heading for heading, _ in columns.values())]
+    for row in rows:
+        cells = (f"{row[name]:{form}}".rjust(len(head)) for name, (head, form) in columns.items())
+        lines.append("  ".join(cells))
+    for name in ("gain", "audited_gain"):
+        values = [row[name] for row in rows if math.isfinite(row[name])]
+        if values:
+            low, middle, high = np.percentile(values, (0, 50, 100))
+            lines.append(
+                f"{name.replace('_', ' ')}: {low:.3f} to {high:.3f}, median {middle:.3f}, standard "
+                f"deviation {np.std(values):.3f}"
+            )
+    best = best_of(rows)
+    lines.append(f"best after its audit: start-{best['start']}, gain {best['audited_gain']:.3f}")
+    return "\n".join(lines)
+
+
+def draw(path: Path, out: Path, rows: Sequence[dict[str, Any]]) -> None:
+    """Write a PNG: gains by start, and the designs, the best first, as far as there is room."""
+    from mpmopt.draw import draw_design, new_figure, png
+
+    ranked = sorted(
+        rows, key=lambda row: (_finite(row["audited_gain"]), _finite(row["gain"])), reverse=True
+    )
+    shown = ranked[:8]
+    lines = -(-len(shown) // 4)
+    figure = new_figure(10.0, 3.2 + 1.5 * lines)
+    figure.set_layout_engine("constrained")
+    parts: Any = figure.subfigures(2, 1, height_ratios=(3.0, 1.5 * lines))
+    upper, lower = parts
+    axes = upper.subplots()
+    start = [row["start"] for row in rows]
+    gain, audited = ([row[name] for row in rows] for name in ("gain", "audited_gain"))
+    axes.vlines(start, audited, gain, color="0.7", lw=2, zorder=1)
+    axes.plot(start, gain, "o", color="C0", label="post-processed")
+    axes.plot(start, audited, "s", color="C1", label="after the audit")
+    axes.axhline(np.nanmedian(gain), color="C0", ls=":", lw=1, label="median")
+    if np.isfinite(audited).any():
+        axes.axhline(np.nanmedian(audited), color="C1", ls=":", lw=1)
+    best = ranked[0]
+    axes.plot(
+        best["start"], best["audited_gain"], "s", ms=13, mfc="none", mec="crimson", mew=1.5,
+        label="best",
+    )  # fmt: skip
+    axes.axhline(0.0, color="black", lw=0.8)
+    axes.set_xticks(start)
+    axes.set_xlabel("start (0: plain)")
+    axes.set_ylabel("gain over the full block")
+    axes.legend(fontsize=8, ncols=4, loc="lower right")
+    axes.grid(True, axis="y", alpha=0.3)
+    for axis, row in zip(lower.subplots(lines, 4, squeeze=False).flat, shown):
+        kept = runfile.read(out / f"start-{row['start']}" / "run.h5")
+        draw_design(axis, kept.problem(), kept.best)
+        axis.set_title(f"start {row['start']}: {row['audited_gain']:.3f}", fontsize=9)
+    for axis in lower.axes:
+        axis.set_axis_off()
+    replace_file(path, png(figure))

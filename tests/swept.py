@@ -1,0 +1,64 @@
+"""What tests sweep. Processes that compute import it from here, and little else."""
+
+import os
+import signal
+import time
+
+
+def note(log, text):
+    """One line at the end of a file, whole, whoever else writes."""
+    handle = os.open(log, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
+    os.write(handle, f"{text}\n".encode())
+    os.close(handle)
+
+
+def noted(log):
+    return log.read_text().split() if log.exists() else []
+
+
+def square(x, log=os.devnull):
+    note(log, x)
+    return {"square": x * x}
+
+
+def slow_square(x, log):
+    note(log, os.getpid())
+    time.sleep(0.1)
+    return {"square": x * x}
+
+
+def picky(x, log, refused):
+    note(log, x)
+    if x in refused:
+        raise ValueError(f"{x} is refused\0\nfor good")
+    return {"square": x * x}
+
+
+def deadly(x, log, once=(), always=(), slow=()):
+    """Kills its own process at some points, once or always."""
+    note(log, x)
+    if x in slow:
+        time.sleep(1.0)
+    if x in always or (x in once and noted(log).count(str(x)) == 1):
+        time.sleep(0.2)  # others are under way
+        os.kill(os.getpid(), signal.SIGKILL)
+    return {"square": x * x}
+
+
+def surroundings():
+    return {"threads": os.environ.get("MPMOPT_THREADS", ""), "process": os.getpid()}
+
+
+def gradient(scene, phi):
+    import numpy as np
+
+    from mpmopt.problem import Problem
+    from mpmopt.scene import Scene
+
+    problem = Problem(Scene.from_json(scene))
+    value, slope = problem.value_and_gradient(problem.join(np.array(phi), 0.7, -0.3, -0.5))
+    return {"value": value, "gradient": slope, "steps": problem.scene.steps, "name": "small"}
+
+
+def whatever(kind):
+    return {"none": {"x": None}, "nested": {"x": {"y": 1}}, "slash": {"x/y": 1.0}, "no": 3}[kind]

@@ -1,0 +1,112 @@
+"""Several starts: the field they begin with, what they leave, and which is the best."""
+
+import csv
+import dataclasses
+import json
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from walker import slanted_legs, walker
+
+from mpmopt import runfile
+from mpmopt.case import Case, main
+from mpmopt.multistart import AMPLITUDE, LENGTH, best_of, random_start, report
+from mpmopt.optimize import Settings, Stage
+from mpmopt.problem import Problem
+
+SCENE = walker(64, 8e-4)
+SIDE = 20 / 64  # the longest of the walker's design domain
+
+
+def test_the_first_start_is_the_plain_one_and_others_differ(rng):
+    position = rng.uniform(0.0, SIDE, (50, 2))
+    assert not random_start(SCENE, 0)(position).any()
+    fields = [random_start(SCENE, seed)(position) for seed in range(4)]
+    again = random_start(SCENE, 3)(position)
+    assert np.array_equal(fields[3], again)
+    assert all(np.abs(one - other).max() > 0.1 for one, other in pairwise(fields))
+    assert max(np.abs(field).max() for field in fields) <= 1.0
+
+
+def test_a_start_is_a_gaussian_field_of_the_stated_amplitude_and_length():
+    distance = np.array([0.0, 0.5, 1.0, 2.0]) * LENGTH * SIDE
+    for direction in np.eye(2):
+        line = 0.1 + distance[:, None] * direction
+        values = np.array([random_start(SCENE, seed)(line) for seed in range(1, 2001)])
+        covariance = values[:, :1].T @ values / len(values) / AMPLITUDE**2
+        wanted = np.exp(-((distance / (LENGTH * SIDE)) ** 2) / 2.0)
+        assert np.abs(values.mean(axis=0)).max() <= 4.0 * AMPLITUDE / math.sqrt(len(values))
+        assert np.abs(covariance - wanted).max() <= 0.1
+
+
+def test_every_grid_begins_with_the_same_field():
+    field = random_start(SCENE, 5)
+    fine = random_start(walker(128, 5e-4), 5)
+    coarse, there = Problem(SCENE), Problem(walker(128, 5e-4))
+    start = coarse.join(field(coarse.particles.position[coarse.particles.designed]), 1, 0, 0)
+    other = there.join(fine(there.particles.position[there.particles.designed]), 1, 0, 0)
+    # Nearest particles lie a quarter of a fine cell apart along each axis.
+    moved = np.abs(there.transfer(coarse, start) - other).max()
+    assert moved <= 0.1
+    assert np.ptp(start[: coarse.particles.designed.sum()]) > 0.5
+
+
+def row(start, gain, audited):
+    return {
+        "start": start, "post_processed": 0.2 + gain, "gain": gain, "kept_half_step": 1.0,
+        "kept_half_cells": audited / gain, "audited_gain": audited, "loose_particles": 0,
+        "failed_evaluations": 0, "seconds": 1.0,
+    }  # fmt: skip
+
+
+def test_the_best_is_named_after_its_audit():
+    rows = [row(0, 0.3, 0.1), row(1, 0.2, 0.19), row(2, 0.4, math.nan), row(3, 0.1, 0.1)]
+    assert best_of(rows)["start"] == 1
+    assert best_of(rows[2:3])["start"] == 2
+    lines = report(rows).splitlines()
+    assert lines[-1] == "best after its audit: start-1, gain 0.190"
+    assert lines[-3].startswith("gain: 0.100 to 0.400, median 0.250")
+    assert lines[-2].startswith("audited gain: 0.100 to 0.190, median 0.100")
+    assert len({len(line) for line in lines[:5]}) == 1
+
+
+TINY = Case(
+    dataclasses.replace(SCENE, steps=60),
+    Settings(
+        (Stage(4.0, 1e-2, 1e-3, 8e-4, solid=True),),
+        window=1, least_iterations=2, most_iterations=2,
+    ),
+    slanted_legs,
+)  # fmt: skip
+
+
+def test_starts_leave_their_runs_and_are_run_once(tmp_path, capsys):
+    def command(starts):
+        assert main("A case.", {"default": TINY}, ["--out", str(tmp_path), *starts]) == 0
+        return capsys.readouterr().out
+
+    first = command(["--starts", "1"])
+    kept = [tmp_path / f"start-{k}" / "run.h5" for k in range(2)]
+    before = kept[0].stat().st_mtime_ns
+    second = command(["--starts", "2"])
+    assert kept[0].stat().st_mtime_ns == before
+    assert second.splitlines()[1] == first.splitlines()[1]
+    with (tmp_path / "starts.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [line["start"] for line in rows] == ["0", "1"]
+    for number, line in enumerate(rows):
+        summary = json.loads((kept[number].parent / "summary.json").read_text())
+        assert runfile.read(kept[number]).summary == summary
+        gain = summary["post_processed"] - summary["reference"]
+        assert float(line["gain"]) == pytest.approx(gain, rel=1e-3)
+    assert len({line["optimised"] for line in rows}) == 2
+    assert (tmp_path / "starts.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize("wrong", [["--starts", "0"], ["--scheduler", "tcp://here:1"]])
+def test_starts_and_scheduler_must_make_sense(tmp_path, capsys, wrong):
+    with pytest.raises(SystemExit, match="2"):
+        main("A case.", {"default": TINY}, ["--out", str(tmp_path), *wrong])
+    assert wrong[0] in capsys.readouterr().err
