@@ -244,7 +244,7 @@ def draw(path: Path, out: Path, rows: Sequence[dict[str, Any]]) -> None:
     axes.set_xticks(start)
     axes.set_xlabel("start (0: plain)")
     axes.set_ylabel("gain over the full block")
-    axes.legend(fontsize=8, ncols=4, loc="lower right")
+    axes.legend(fontsize=8, ncols=4, loc="lower center", bbox_to_anchor=(0.5, 1.0), frameon=False)
     axes.grid(True, axis="y", alpha=0.3)
     for axis, row in zip(lower.subplots(lines, 4, squeeze=False).flat, shown):
         kept = runfile.read(out / f"start-{row['start']}" / "run.h5")
