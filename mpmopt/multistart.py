@@ -163,15 +163,19 @@ def multistart(
     )
     if not rows:
         raise SweepError(f"no start came to an end\n{failed}")
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(
-        {k: f"{v:.4g}" if isinstance(v, float) else v for k, v in row.items()} for row in rows
-    )
-    replace_file(out / "starts.csv", text.getvalue().encode())
+    replace_file(out / "starts.csv", as_csv(rows).encode())
     draw(out / "starts.png", out, rows)
     return failed + report(rows)
+
+
+def as_csv(rows: Sequence[dict[str, Any]]) -> str:
+    """Rows as comma-separated values, numbers with four digits."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(name.replace("_", " ") for name in rows[0])
+    for row in rows:
+        writer.writerow(f"{v:.4g}" if isinstance(v, float) else v for v in row.values())
+    return text.getvalue()
 
 
 def best_of(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
