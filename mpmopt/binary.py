@@ -84,6 +84,13 @@ def post_processed(problem: Problem, x: NDArray, threshold: float = THRESHOLD) -
     return distance(problem.scene, problem.gamma(x) >= threshold, problem.split(x))
 
 
+def unactuated(problem: Problem, x: NDArray) -> float:
+    """Objective L of the post-processed design when no actuator works: how far it merely falls."""
+    variables = problem.split(x)
+    still = variables._replace(a=0.0 * variables.a, b=0.0 * variables.b)
+    return distance(problem.scene, problem.gamma(x) >= THRESHOLD, still)
+
+
 def pieces(scene: Scene, keep: NDArray[np.bool_]) -> NDArray[np.int64]:
     """Number of the connected piece that each kept design particle belongs to.
 

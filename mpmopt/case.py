@@ -16,7 +16,15 @@ from numpy.typing import NDArray
 
 from mpmopt import runfile
 from mpmopt.audit import audit
-from mpmopt.binary import THRESHOLD, Drawing, farthest, full_block, pieces, post_processed
+from mpmopt.binary import (
+    THRESHOLD,
+    Drawing,
+    farthest,
+    full_block,
+    pieces,
+    post_processed,
+    unactuated,
+)
 from mpmopt.checkpoints import Checkpointing
 from mpmopt.errors import MpmoptError, SimulationError, StorageError
 from mpmopt.files import locked, make_folder, replace_file
@@ -278,6 +286,7 @@ def summarise(result: Optimisation, drawing: Mapping[int, NDArray[np.bool_]]) ->
         else _value_or_none(lambda: farthest(problem.scene, lambda _: there, *actuations)),
         "optimised": best.objective,
         "post_processed": _value_or_none(lambda: post_processed(problem, best.x)),
+        "actuation_off": _value_or_none(lambda: unactuated(problem, best.x)),
         "loose_particles": int(
             (pieces(problem.scene, problem.gamma(best.x) >= THRESHOLD) > 0).sum()
         ),

@@ -48,6 +48,7 @@ def test_a_small_walker_walks_even_without_its_void(folder):
     assert summary["reference_drawn"] >= summary["reference"] + 0.05  # slanted legs do travel
     assert summary["optimised"] - summary["reference"] >= 0.05
     assert summary["post_processed"] - summary["reference"] >= 0.03
+    assert summary["actuation_off"] < summary["post_processed"]
     assert summary["failed_evaluations"] == 0
     assert summary["loose_particles"] >= 0
     assert summary["evaluations"] <= 30
@@ -57,6 +58,7 @@ def test_a_small_crawler_crawls_even_without_its_void(tmp_path):
     case = Case(crawler.crawler(64, 8e-4), SMALL.settings, crawler.slanted_legs)
     summary = run(case, tmp_path)
     assert summary["start"] == pytest.approx(23 / 64, abs=1e-9)
+    assert summary["actuation_off"] == pytest.approx(23 / 64, abs=1e-9)  # no gravity, no fall
     assert summary["reference"] == pytest.approx(23 / 64, abs=1e-3)
     assert summary["reference_drawn"] >= summary["reference"] + 0.02
     assert summary["optimised"] - summary["reference"] >= 0.05
