@@ -7,9 +7,9 @@ __version__ = "0.1.0"
 
 _MODULES = (
     "actuation", "audit", "binary", "case", "checkpoints", "design", "discretisation", "draw",
-    "errors", "files", "film", "history", "interrupt", "mma", "motion", "mpm", "multistart",
-    "objective", "optimize", "particles", "plot", "problem", "progress", "runfile", "scene",
-    "schematic", "simulate", "sweeps", "verify",
+    "errors", "export", "files", "film", "history", "interrupt", "mma", "motion", "mpm",
+    "multistart", "objective", "optimize", "outline", "particles", "plot", "problem",
+    "progress", "runfile", "scene", "schematic", "simulate", "sweeps", "verify", "vtkhdf",
 )  # fmt: skip
 
 

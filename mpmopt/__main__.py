@@ -20,6 +20,7 @@ import argparse
 import logging
 import sys
 from pathlib import Path
+from typing import Any
 
 from mpmopt import __version__
 from mpmopt.errors import MpmoptError
@@ -176,6 +177,28 @@ def resume(path: Path) -> int:
     return case.reported(lambda: case.table(case.resume(path)), case.how_to_go_on(path))
 
 
+def export(path: Path, out: Path | None, **options: Any) -> int:
+    """Write a run's best design as files that other programs read, and print what was written."""
+    from mpmopt import runfile
+    from mpmopt.export import export as exported
+    from mpmopt.export import size
+
+    run = runfile.read(path)
+    done = exported(run.problem(), run.best, out or path.parent, **options)
+    for file in done.paths:
+        print(f"{file}  {file.stat().st_size} bytes")
+    if done.polygons:
+        width, height = size(done.polygons)
+        area = sum(polygon.area for polygon in done.polygons)
+        holes = sum(len(polygon.rings) - 1 for polygon in done.polygons)
+        print(f"size    {width:.6g} x {height:.6g} mm, area {area:.6g} mm2")
+        print(f"pieces  {len(done.polygons)}, with {holes} holes")
+    if done.loose:
+        left = "left out" if options["drop_loose"] else "still there: --drop-loose leaves them out"
+        print(f"{done.loose} particles hang on nothing, {left}")
+    return 0
+
+
 def main(argv: list[str] | None = None) -> int:
     """Run a command; the exit code is one of those in the module's text."""
     arguments = _parser().parse_args(argv)
@@ -298,6 +321,44 @@ def _parser() -> argparse.ArgumentParser:
     command.set_defaults(
         do=lambda arguments: cheapest(
             arguments.path, arguments.tol, arguments.gradient_tol, arguments.seconds
+        )
+    )
+
+    command = add(
+        "export",
+        "write its design as drawing, solid and motion",
+        "Write the best design without grey: design.svg, design.dxf and design.stl at a size in\n"
+        "millimetres, motion.vtkhdf in the scene's units. DXF and STL need pip install\n"
+        "'mpmopt[export]'.",
+        "out/walker/run.h5 --svg --dxf --stl --vtk --width 60",
+        "out/walker/run.h5 --stl --scale 200 --thickness 8 --drop-loose --out parts",
+    )
+    for name, text in (
+        ("svg", "write a drawing"),
+        ("dxf", "write a drawing for CAD"),
+        ("stl", "write a watertight solid"),
+        ("vtk", "write the motion, for ParaView"),
+    ):
+        command.add_argument(
+            f"--{name}", dest="formats", action="append_const", const=name, default=[], help=text
+        )
+    command.add_argument("--width", type=float, metavar="MM", help="width of the drawing")
+    command.add_argument(
+        "--scale", type=float, metavar="MM", help="instead: length of the scene's unit"
+    )
+    command.add_argument(
+        "--thickness", type=float, metavar="MM", help="of the solid (default: a tenth of the width)"
+    )
+    command.add_argument(
+        "--threshold", type=float, default=0.3, help="gamma from which a particle stays (0.3)"
+    )
+    command.add_argument(
+        "--drop-loose", action="store_true", help="leave out pieces that hang on nothing"
+    )
+    command.add_argument("--out", type=Path, metavar="DIR", help="folder (default: the run's)")
+    command.set_defaults(
+        do=lambda arguments: export(
+            **{name: value for name, value in vars(arguments).items() if name != "do"}
         )
     )
     return parser

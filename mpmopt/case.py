@@ -7,7 +7,7 @@ import json
 import logging
 import sys
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -54,11 +54,15 @@ class Case:
     drawing : callable
         From positions (D, 2) of the design particles to which are there (D,): a second reference
         design besides the full block.
+    start : mapping, optional
+        First phi, a, theta and b, as `Problem.join` takes them: one number for all actuators, or
+        one for each.
     """
 
     scene: Scene
     settings: Settings
     drawing: Drawing
+    start: Mapping[str, Any] = field(default_factory=lambda: START)
 
 
 def _sharpening(time_step: float, stages: int, coarsening: int = 1) -> tuple[Stage, ...]:
@@ -164,7 +168,7 @@ def run(
     force : bool, optional
         Begin anew and replace whatever the folder holds under those names.
     phi : callable, optional
-        Of positions (D, 2): phi (D,) that a run begins with. By default it is zero.
+        Of positions (D, 2): phi (D,) that a run begins with, instead of the case's.
 
     Returns
     -------
@@ -180,11 +184,19 @@ def run(
         As `optimise` does.
     """
     path = out / "run.h5"
+    first = case.settings.stages[0]
+    problem = Problem(first.scene(case.scene), first.beta)
+    turns = QUARTER_TURNS if case.settings.scouting else (0.0,)
+    position = problem.particles.position[problem.particles.designed]
+    plain = case.start if phi is None else {**case.start, "phi": phi(position)}
+    starts = [problem.join(**{**plain, "theta": _turned(case, turn)}) for turn in turns]
     make_folder(out)
     with locked(path):
         if path.exists() and not force:
             kept = runfile.read(path)
-            if (kept.scene, kept.settings) != (case.scene, case.settings):
+            begun = kept.run.first.x if kept.run.first else kept.run.legs[0].x
+            same = (kept.scene, kept.settings) == (case.scene, case.settings)
+            if not same or not np.array_equal(begun, starts[0]):
                 raise StorageError(
                     f"{path} holds an earlier run of another case; choose another folder, or "
                     "--force to replace it"
@@ -196,14 +208,7 @@ def run(
                 f"{out} holds {', '.join(foreign)} but no run.h5; choose another folder, or "
                 "--force to replace them"
             )
-        first = case.settings.stages[0]
-        problem = Problem(first.scene(case.scene), first.beta)
-        turns = QUARTER_TURNS if case.settings.scouting else (0.0,)
-        position = problem.particles.position[problem.particles.designed]
-        plain = START if phi is None else {**START, "phi": phi(position)}
-        starts = [problem.join(**{**plain, "theta": START["theta"] + turn}) for turn in turns]
-        begun = begin(case.scene, case.settings, starts)
-        runfile.write(path, begun, drawing=drawn(case))
+        runfile.write(path, begin(case.scene, case.settings, starts), drawing=drawn(case))
         return _go_on(path, runfile.read(path), checkpointing)
 
 
@@ -258,6 +263,12 @@ def _go_on(
     _draw(path.parent, result)
     runfile.write(path, result, summary, kept.drawing)
     return summary
+
+
+def _turned(case: Case, turn: float) -> np.ndarray:
+    """The start's theta and a turn, within [-1, 1]."""
+    theta = np.asarray(case.start["theta"], dtype=float) + turn
+    return np.where(np.abs(theta) > 1.0, theta - 2.0 * np.sign(theta), theta)
 
 
 def summarise(result: Optimisation, drawing: Mapping[int, NDArray[np.bool_]]) -> dict[str, Any]:

@@ -16,13 +16,23 @@ from mpmopt.scene import Material, Scene
 NEGLIGIBLE = 1e-8
 
 
-def filter_matrix(scene: Scene, particles: Particles) -> scipy.sparse.csr_array[np.float64]:
+def filter_matrix(
+    scene: Scene, particles: Particles, points: NDArray[np.float64] | None = None
+) -> scipy.sparse.csr_array[np.float64]:
     """The paper's filter (sec. 2.3, steps 1 to 3) as one matrix (D, D) over the D design particles.
 
     Particle to grid, 3 x 3 convolution (`Scene.filter_passes` times), grid to particle. Only design
     particles take part; nodes that carry none are left out and the weights that remain are scaled
     to sum to one, so that a constant field stays constant. A mirror shows the filter the other
     half's particles: by itself it does what the paper's mapping of one half to the other does.
+
+    Parameters
+    ----------
+    scene : Scene
+    particles : Particles
+    points : (M, 2) array, optional
+        Where else the filtered field is wanted, in design regions or on their edges: the matrix is
+        (M, D) then.
     """
     rows = scene.grid.cells[1] + 1
     body = lay_out(scene, whole=True)
@@ -60,17 +70,21 @@ def filter_matrix(scene: Scene, particles: Particles) -> scipy.sparse.csr_array[
         matrix = (convolution @ matrix).tocsr()
         matrix.data[matrix.data < NEGLIGIBLE] = 0.0
         matrix.eliminate_zeros()
-    matrix = normalised((to_particles @ matrix).tocsr())
-    if scene.mirror is None:
-        return matrix.tocsr()
-    # Rows of the simulated half; columns summed over a particle and its image.
-    kept = np.flatnonzero(position[:, scene.mirror.normal] < scene.mirror.position)
     half, whole = particles.subset(particles.designed), body.subset(body.designed)
-    image = mirror_images(scene, half, whole)
-    spread = scipy.sparse.csr_array(
-        (np.ones(image.size), (np.arange(image.size), image)), shape=(image.size, kept.size)
+    points = half.position if points is None else points
+    nodes, values = interpolation(points, scene.grid.dx, rows)
+    row, k = np.nonzero((values > 0.0) & np.isin(nodes, used))
+    to_points = scipy.sparse.csr_array(
+        (values[row, k], (row, np.searchsorted(used, nodes[row, k]))), (len(points), used.size)
     )
-    return (matrix.tocsr()[kept] @ spread).tocsr()
+    matrix = normalised((to_points @ matrix).tocsr()).tocsr()
+    if scene.mirror is None:
+        return matrix
+    # Columns are summed over a particle and its image.
+    image = mirror_images(scene, half, whole)
+    shape = (image.size, len(half.position))
+    ones = np.ones(image.size)
+    return (matrix @ scipy.sparse.csr_array((ones, (np.arange(image.size), image)), shape)).tocsr()
 
 
 def project(phi: NDArray, beta: float) -> NDArray:

@@ -59,3 +59,7 @@ class MissingLibraryError(MpmoptError, ImportError):
 
 class SweepError(MpmoptError, RuntimeError):
     """A sweep that cannot be made, continued or read, or a point of it that failed."""
+
+
+class ExportError(MpmoptError, ValueError):
+    """A design that cannot be written as asked: a size that makes no sense."""

@@ -1,13 +1,17 @@
 """Audits: the same robot in other discretisations."""
 
+import dataclasses
+
 import numpy as np
 import pytest
+from climber import climber
 from conftest import small_scene
 from crawler import crawler
 from walker import slanted_legs, walker
 
 from mpmopt.audit import audit, refined
 from mpmopt.binary import distance
+from mpmopt.errors import SceneError
 from mpmopt.particles import lay_out
 from mpmopt.problem import Problem
 from mpmopt.scene import Actuator
@@ -64,3 +68,11 @@ def test_a_body_without_design_is_audited_too():
     rows = audit(problem, problem.join(np.empty(0), 0.2, 0.1, 0.1))
     assert rows[1].distance == rows[1].reference
     assert np.isnan(rows[1].kept)
+
+
+def test_a_wide_filter_is_no_obstacle_to_finer_cells():
+    """Refined once more it would be too large for a scene, but solid bodies need none."""
+    scene = climber(128, 5e-4)
+    with pytest.raises(SceneError, match="shorter filter_length"):
+        dataclasses.replace(refined(scene), filter_length=scene.filter_length)
+    assert refined(scene).grid.cells == (256, 256)

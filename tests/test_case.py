@@ -8,7 +8,9 @@ import subprocess
 import sys
 from pathlib import Path
 
+import climber
 import crawler
+import numpy as np
 import pytest
 from walker import CASES, slanted_legs, walker
 
@@ -66,6 +68,33 @@ def test_a_small_crawler_crawls_even_without_its_void(tmp_path):
     assert summary["failed_evaluations"] == 0
 
 
+def test_a_small_climber_climbs_even_without_its_void(tmp_path):
+    settings = dataclasses.replace(SMALL.settings, least_iterations=10, most_iterations=10)
+    case = Case(climber.climber(64, 8e-4), settings, climber.slanted_legs, climber.START)
+    summary = run(case, tmp_path)
+    assert summary["start"] <= 30 / 64  # where it is put: it sags
+    best_reference = max(summary["reference"], summary["reference_drawn"])
+    assert summary["optimised"] - best_reference >= 0.05
+    assert summary["post_processed"] - best_reference >= 0.03
+    assert summary["failed_evaluations"] == 0
+    assert np.shape(summary["theta"]) == (3,)  # each core kept a phase of its own
+    assert np.ptp(summary["theta"]) >= 0.5
+
+
+def test_a_case_starts_where_it_says_or_a_turn_of_phases_away(tmp_path):
+    start = {"phi": 0.5, "a": (0.9, 0.8, 0.7), "theta": (0.9, -0.9, 0.2), "b": (0.0, -0.1, -0.2)}
+    once = Settings(
+        SMALL.settings.stages[:1], window=1, least_iterations=1, most_iterations=1, scouting=1
+    )
+    scene = dataclasses.replace(climber.climber(64, 8e-4), steps=10)
+    summary = run(Case(scene, once, climber.slanted_legs, start), tmp_path)
+    assert summary["evaluations"] == 4
+    assert (summary["a"], summary["b"]) == (list(start["a"]), list(start["b"]))
+    turns = np.exp(1j * np.pi * np.subtract(summary["theta"], start["theta"]))
+    assert turns == pytest.approx(turns[0])
+    assert turns**4 == pytest.approx(1.0)  # a multiple of a quarter
+
+
 def test_the_folder_holds_run_summary_and_pictures(folder):
     out, summary = folder
     names = {path.name for path in out.iterdir()}
@@ -97,6 +126,9 @@ def test_a_finished_run_is_left_as_it_is(folder):
 def test_a_run_of_another_case_is_never_overwritten(folder):
     out, _ = folder
     before = (out / "run.h5").read_bytes()
+    another_start = dataclasses.replace(SMALL, start={"phi": 0.1, "a": 1.0, "theta": 0.0, "b": 0.0})
+    with pytest.raises(StorageError, match="earlier run of another case"):
+        run(another_start, out)
     other = dataclasses.replace(SMALL, scene=dataclasses.replace(SMALL.scene, steps=10))
     with pytest.raises(StorageError, match="earlier run of another case"):
         run(other, out)

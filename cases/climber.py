@@ -1,0 +1,57 @@
+"""A climbing robot in a vertical shaft: three squeezed cores, each with a phase of its own.
+
+    python cases/climber.py --preview --out DIR
+
+It is not in the paper. It shows a scene of one's own: gravity along the shaft, nothing to stand
+on, several actuators.
+"""
+
+import sys
+
+import numpy as np
+
+from mpmopt.case import Case, main, sharpened
+from mpmopt.scene import Actuator, Design, Grid, Mirror, Scene, Wall
+
+
+def climber(cells: int, time_step: float) -> Scene:
+    """The climber on `cells` x `cells` cells of the unit square, for one second."""
+    c = 1 / 64
+    left, right, low, high = 26 * c, 38 * c, 18 * c, 42 * c  # of the body, which fills the shaft
+    return Scene(
+        grid=Grid(cells=(cells, cells), dx=1 / cells),
+        time_step=time_step,
+        steps=round(1.0 / time_step),
+        gravity=(0.0, -1.0),
+        direction=(0.0, 1.0),
+        walls=(Wall("x", left), Wall("x", right, "above")),
+        body=(
+            Design((left, low), (right, 21 * c)),
+            Design((left, 21 * c), (30 * c, 39 * c)),
+            *(Actuator((30 * c, y * c), (34 * c, (y + 6) * c)) for y in (21, 27, 33)),
+            Design((34 * c, 21 * c), (right, 39 * c)),
+            Design((left, 39 * c), (right, high)),
+        ),
+        filter_length=1.5 * c,  # thin legs slip on finer cells
+        mirror=Mirror("x", 32 * c),
+    )
+
+
+def slanted_legs(positions: np.ndarray) -> np.ndarray:
+    """What one would draw by hand: four pairs of legs that lean down."""
+    c = 1 / 64
+    x, y = positions.T
+    foot = 4 * c * abs(x - 32 * c) / (6 * c)  # how far down a leg has leant at this distance
+    return np.any([abs(y + foot - top * c) <= 1.25 * c for top in (24, 30, 36, 41)], axis=0)
+
+
+# Three cores a quarter of a turn apart, the lowest first; squeezed outwards on the average.
+START = {"phi": 0.0, "a": 1.0, "theta": (0.7, 0.2, -0.3), "b": -0.5}
+
+CASES = {
+    "default": Case(climber(128, 5e-4), sharpened(5e-4), slanted_legs, START),
+    "preview": Case(climber(64, 8e-4), sharpened(8e-4), slanted_legs, START),
+}
+
+if __name__ == "__main__":
+    sys.exit(main(__doc__.splitlines()[0], CASES))

@@ -1,0 +1,384 @@
+"""Designs as files: read back by other people's libraries, and measured."""
+
+import dataclasses
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import svgelements
+import trimesh
+from conftest import small_scene
+from crawler import crawler
+from scipy.ndimage import label
+from scipy.spatial import KDTree
+from vtkmodules.util.numpy_support import vtk_to_numpy
+from vtkmodules.vtkIOHDF import vtkHDFReader
+from walker import walker
+
+from mpmopt import runfile
+from mpmopt.__main__ import main
+from mpmopt.binary import pieces, solid_body
+from mpmopt.errors import DesignError, ExportError, MissingLibraryError, StorageError
+from mpmopt.export import export
+from mpmopt.history import Candidate
+from mpmopt.optimize import Settings, Stage, begin
+from mpmopt.outline import outline
+from mpmopt.particles import lay_out, mirror_images
+from mpmopt.problem import Problem
+from mpmopt.scene import Design, Grid, Scene, Solid
+
+WIDTH = 60.0  # mm
+C = 1 / 32
+
+
+def block(**changes) -> Scene:
+    """A bar on a block of design, of 48 x 40 particles together."""
+    body = Solid((4 * C, 20 * C), (28 * C, 24 * C)), Design((4 * C, 4 * C), (28 * C, 20 * C))
+    return Scene(Grid((32, 32), C), 1e-3, 5, body, **changes)
+
+
+def discs(problem, *circles, inside=-1.0):
+    """A design that is solid (or void) but in circles of (x, y, radius), in units of C."""
+    position = problem.particles.position[problem.particles.designed] / C
+    phi = np.full(len(position), -inside)
+    for x, y, radius in circles:
+        phi[np.hypot(*(position - (x, y)).T) < radius] = inside
+    return problem.join(phi, 0.0, 0.0, 0.0)
+
+
+@pytest.fixture(scope="module")
+def holed():
+    """Two holes, and a notch in the lower edge in which a loose disc lies."""
+    problem = Problem(block(), beta=16.0)
+    x = discs(problem, (8, 15, 3), (22, 15, 2.5), (16, 6, 5.5))
+    disc = discs(problem, (16, 6.5, 1.6), inside=1.0)
+    return problem, np.maximum(x, disc)
+
+
+def mask(problem, x):
+    """Which cells of the particles' lattice are solid, with a ring of empty ones around them."""
+    body = lay_out(problem.scene, whole=True)
+    there = np.ones(len(problem.particles.position), dtype=bool)
+    there[problem.particles.designed] = problem.gamma(x) >= 0.3
+    there = there[mirror_images(problem.scene, problem.particles, body)]
+    i, j = np.floor(body.position / (0.5 * problem.scene.grid.dx)).astype(int).T
+    lattice = np.zeros((i.max() + 2, j.max() + 2), dtype=bool)
+    lattice[i[there], j[there]] = True
+    return lattice
+
+
+def counted(problem, x):
+    """Pieces and holes of the lattice."""
+    lattice = mask(problem, x)
+    return label(lattice)[1], label(~lattice, np.ones((3, 3)))[1] - 1
+
+
+def particles_area(problem, x, drop_loose=False):
+    """Of the bar and what is kept of the block, in square millimetres."""
+    piece = pieces(problem.scene, problem.gamma(x) >= 0.3)
+    kept = (piece == 0) if drop_loose else (piece >= 0)
+    return (48 * 8 + kept.sum()) * (WIDTH / 48) ** 2
+
+
+def shoelace(ring):
+    (x, y), (x1, y1) = np.asarray(ring).T, np.roll(ring, -1, axis=0).T
+    return 0.5 * np.sum(x * y1 - x1 * y)
+
+
+def test_the_outline_passes_between_particles_that_stay_and_particles_that_go(holed):
+    problem, x = holed
+    gamma = np.ones(len(problem.particles.position))
+    gamma[problem.particles.designed] = problem.gamma(x)
+    for threshold in (0.1, 0.3, 0.7):
+        clear = np.abs(gamma - threshold) > 0.01  # not on the line, but for rounding
+        assert clear.mean() >= 0.99
+        points = problem.particles.position[clear]
+        inside = np.any([polygon.contains(points) for polygon in outline(problem, x, threshold)], 0)
+        assert np.array_equal(inside, gamma[clear] >= threshold)
+
+
+def test_a_full_block_is_its_rectangle_and_an_empty_one_what_is_solid():
+    problem = Problem(walker(64, 8e-4), beta=4.0)
+    for phi, low in ((1.0, 4), (-1.0, 11)):
+        (polygon,) = outline(problem, problem.join(phi, 1.0, 0.0, 0.0))
+        (ring,) = polygon.rings
+        assert ring * 64 == pytest.approx(
+            np.array([(23, low), (23, 14), (3, 14), (3, low)])[_order(ring)], abs=1e-12
+        )
+
+
+def _order(ring):
+    """How to turn the corners of a rectangle, given from its lower right one on."""
+    first = np.argmin(ring[:, 1] - ring[:, 0])
+    return (np.arange(len(ring)) - first) % len(ring)
+
+
+def test_a_disc_is_smooth_and_has_the_area_of_a_disc():
+    problem = Problem(block(), beta=16.0)
+    (_, disc) = outline(problem, discs(problem, (16, 11, 4), inside=1.0), threshold=0.5)
+    (ring,) = disc.rings
+    radius = np.hypot(*(ring / C - (16, 11)).T)
+    assert radius == pytest.approx(4.0, abs=0.15)  # 0.3 of a particle spacing
+    assert disc.area / C**2 == pytest.approx(np.pi * 16, rel=0.02)
+    edges = np.roll(ring, -1, axis=0) - ring
+    turn = np.angle(np.exp(1j * np.diff(np.unwrap(np.arctan2(edges[:, 1], edges[:, 0])))))
+    assert np.abs(turn).max() <= np.radians(15)  # stairs would turn by 45 or 90 degrees
+
+
+def test_straight_sides_stay_straight(holed):
+    """The bar's sides and the block's are single edges, but where the notch is."""
+    (body, _) = outline(*holed)
+    ring = body.rings[0] / C
+    edges = np.roll(ring, -1, axis=0) - ring
+    straight = edges[np.abs(edges).max(axis=1) > 2.0]
+    assert len(straight) == 5
+    assert np.count_nonzero(straight) == 5
+    assert sorted(np.abs(straight).max(axis=1))[-3:] == [20.0, 20.0, 24.0]
+
+
+def test_a_loose_ring_around_what_is_solid_is_dropped():
+    scene = block()
+    core = Solid((14 * C, 14 * C), (18 * C, 18 * C))
+    around = ((4, 4), (28, 14)), ((4, 14), (14, 18)), ((18, 14), (28, 18)), ((4, 18), (28, 24))
+    design = (Design(*(tuple(C * k for k in corner) for corner in box)) for box in around)
+    problem = Problem(dataclasses.replace(scene, body=(core, *design)), beta=16.0)
+    ring = discs(problem, (16, 16, 7), inside=1.0)
+    x = np.minimum(ring, discs(problem, (16, 16, 4.5)))
+    assert [len(polygon.rings) for polygon in outline(problem, x)] == [2, 1]
+    (left,) = outline(problem, x, drop_loose=True)
+    assert left.area == pytest.approx(16 * C**2)
+
+
+@pytest.mark.parametrize("loose", [False, True])
+def test_an_svg_is_read_back_with_area_pieces_holes_and_size(holed, tmp_path, loose):
+    problem, x = holed
+    export(problem, x, tmp_path, ["svg"], width=WIDTH, drop_loose=loose)
+    image = svgelements.SVG.parse(str(tmp_path / "design.svg"), ppi=25.4)  # one pixel is 1 mm
+    paths = [element for element in image.elements() if isinstance(element, svgelements.Path)]
+    holes = area = 0
+    for path in paths:
+        subpaths = (svgelements.Path(subpath) for subpath in path.as_subpaths())
+        rings = [np.array([(p.x, p.y) for p in one.as_points()]) for one in subpaths]
+        areas = [abs(shoelace(ring)) for ring in rings]
+        holes += len(rings) - 1
+        area += areas[0] - sum(areas[1:])
+    assert counted(problem, x) == (2, 2)
+    assert (len(paths), holes) == (2 - loose, 2)
+    assert area == pytest.approx(particles_area(problem, x, loose), rel=0.02)
+    assert (image.width, image.height) == pytest.approx((WIDTH, WIDTH * 40 / 48))
+    boxes = np.array([path.bbox() for path in paths])
+    box = [*boxes[:, :2].min(axis=0), *boxes[:, 2:].max(axis=0)]
+    assert box == pytest.approx([0.0, 0.0, WIDTH, WIDTH * 40 / 48], abs=1e-4)
+    # The bar is at the top: the axis of an SVG points down.
+    top = {round(p.x) for path in paths for p in path.as_points() if abs(p.y) < 1e-6}
+    assert top == {0, round(WIDTH)}
+
+
+def test_a_dxf_is_read_back_with_area_pieces_holes_and_size(holed, tmp_path):
+    problem, x = holed
+    export(problem, x, tmp_path, ["dxf"], width=WIDTH)
+    with (tmp_path / "design.dxf").open("rb") as file:
+        drawing = trimesh.load_path(file, file_type="dxf")
+    assert drawing.units == "millimeters"
+    layers = [entity.layer.lower() for entity in drawing.entities]
+    rings = [entity.discrete(drawing.vertices) for entity in drawing.entities]
+    assert all(np.array_equal(ring[0], ring[-1]) for ring in rings)
+    assert (layers.count("outline"), layers.count("holes")) == counted(problem, x)
+    areas = [
+        abs(shoelace(ring[:-1])) * (-1) ** (layer == "holes") for ring, layer in zip(rings, layers)
+    ]
+    assert sum(areas) == pytest.approx(particles_area(problem, x), rel=0.02)
+    box = np.array([[0.0, 0.0], [WIDTH, WIDTH * 40 / 48]])
+    assert drawing.bounds == pytest.approx(box, abs=1e-9)
+
+
+def test_an_stl_is_watertight_and_has_volume_pieces_holes_and_size(holed, tmp_path):
+    problem, x = holed
+    done = export(problem, x, tmp_path, ["stl"], scale=80.0, thickness=7.0)
+    mesh = trimesh.load_mesh(str(tmp_path / "design.stl"))
+    assert mesh.is_watertight
+    assert mesh.is_winding_consistent
+    drawn = sum(polygon.area for polygon in done.polygons)
+    assert mesh.volume == pytest.approx(7.0 * drawn, rel=1e-5)
+    assert drawn == pytest.approx(particles_area(problem, x), rel=0.02)  # 60 mm = 0.75 * 80 mm
+    count, holes = counted(problem, x)
+    assert mesh.body_count == count
+    assert mesh.euler_number == 2 * (count - holes)
+    box = np.array([[0.0, 0.0, 0.0], [60.0, 50.0, 7.0]])
+    assert mesh.bounds == pytest.approx(box, abs=1e-5)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_random_designs_are_watertight_too(seed, tmp_path):
+    """Ragged outlines with many holes, flat feet on one line and loose crumbs."""
+    problem = Problem(block(), beta=8.0)
+    x = np.random.default_rng(seed).choice([-1.0, 1.0], size=problem.size)
+    done = export(problem, x, tmp_path, ["stl"], width=40.0)
+    mesh = trimesh.load_mesh(str(tmp_path / "design.stl"))
+    assert mesh.is_watertight
+    assert mesh.body_count == len(done.polygons)
+    holes = sum(len(polygon.rings) - 1 for polygon in done.polygons)
+    assert holes >= 3
+    assert mesh.euler_number == 2 * (len(done.polygons) - holes)
+
+
+def test_of_a_mirror_scene_the_whole_body_is_exported(tmp_path):
+    half = crawler(64, 8e-4)
+    rng = np.random.default_rng(1)
+    problem = Problem(half, beta=4.0)
+    x = problem.join(rng.uniform(-1.0, 1.0, problem.size - 3), 1.0, -0.3, -0.5)
+    done = export(problem, x, tmp_path, ["stl"], width=20.0)
+    ys = np.concatenate([polygon.rings[0][:, 1] for polygon in done.polygons])
+    assert (ys.min(), ys.max()) == (0.0, pytest.approx(12.0))
+    mesh = trimesh.load_mesh(str(tmp_path / "design.stl"))
+    image = mesh.vertices * (1.0, -1.0, 1.0) + (0.0, 12.0, 0.0)
+    assert KDTree(mesh.vertices).query(image)[0].max() <= 2e-3  # 1/250 of a particle spacing
+    assert mesh.volume / 2.0 == pytest.approx(mask(problem, x).sum() * 0.5**2, rel=0.05)
+
+
+def read_motion(path):
+    """Times, and points, and data of the cells at each, as VTK reads them."""
+    reader = vtkHDFReader()
+    reader.SetFileName(str(path))
+    reader.UpdateInformation()
+    times, frames = [], []
+    for step in range(reader.GetNumberOfSteps()):
+        reader.SetStep(step)
+        reader.Update()
+        grid = reader.GetOutput()
+        times.append(reader.GetTimeValue())
+        data = grid.GetCellData()
+        arrays = [data.GetArray(k) for k in range(data.GetNumberOfArrays())]
+        frames.append({array.GetName(): vtk_to_numpy(array).copy() for array in arrays})
+        cells = vtk_to_numpy(grid.GetCells().GetConnectivityArray()).reshape(-1, 4)
+        frames[-1]["corners"] = vtk_to_numpy(grid.GetPoints().GetData())[cells]
+        assert set(vtk_to_numpy(grid.GetCellTypes())) == {9}
+    return np.array(times), frames
+
+
+@pytest.mark.parametrize("mirror", [False, True])
+def test_the_motion_is_read_back_by_vtk(tmp_path, mirror):
+    scene = dataclasses.replace(crawler(64, 8e-4) if mirror else small_scene(), steps=40)
+    problem = Problem(scene, beta=4.0)
+    n = problem.size - 3 * len(scene.actuators)
+    phi = np.where(np.arange(n) % 7 < 5, 1.0, -1.0)
+    x = problem.join(phi, 1.0, -0.3, -0.5)
+    export(problem, x, tmp_path, ["vtk"])
+    times, frames = read_motion(tmp_path / "motion.vtkhdf")
+    assert times == pytest.approx(np.arange(41) * scene.time_step)
+    simulation, _ = solid_body(scene, problem.gamma(x) >= 0.3, problem.split(x))
+    states = simulation.run(range(41))
+    count = states.shape[2]
+    spacing = scene.grid.dx / scene.particles_per_cell
+    for step in (0, 17, 40):
+        frame, state = frames[step], states[step]
+        assert len(frame["corners"]) == count * (1 + mirror)
+        centre = frame["corners"].mean(axis=1)
+        assert centre[:count, :2] == pytest.approx(state[0:2].T, abs=1e-6)
+        assert frame["velocity"][:count, :2] == pytest.approx(state[2:4].T, abs=1e-5)
+        areas = [abs(shoelace(quad[:, :2])) for quad in frame["corners"]]
+        assert areas == pytest.approx(frame["jacobian"] * spacing**2, rel=1e-3)
+        assert np.all(frame["stretch"] >= np.sqrt(frame["jacobian"]) - 1e-6)
+        actuator = simulation.particles.actuator
+        expected = np.where(actuator >= 0, simulation.signal[min(step, 39)][actuator], 0.0)
+        assert frame["signal"][:count] == pytest.approx(expected, abs=1e-6)
+        if mirror:
+            image = centre[count:, :2] * (1.0, -1.0) + (0.0, 2 * scene.mirror.position)
+            assert image == pytest.approx(centre[:count, :2], abs=1e-6)
+            areas = np.array(areas)
+            assert areas[count:] == pytest.approx(areas[:count], rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("formats", "options", "what"),
+    [
+        ([], {"width": 60.0}, "ask for some of svg, dxf, stl, vtk"),
+        (["step"], {"width": 60.0}, "unknown"),
+        (["svg"], {}, "width in mm, or a scale"),
+        (["svg"], {"width": 60.0, "scale": 80.0}, "one of them"),
+        (["svg"], {"width": 0.0}, "width"),
+        (["svg"], {"width": -3.0}, "width"),
+        (["svg"], {"width": np.nan}, "width"),
+        (["dxf"], {"scale": np.inf}, "scale"),
+        (["dxf"], {"width": 1e-6}, "from 0.001 to"),
+        (["stl"], {"scale": 1e9}, "choose another size"),
+        (["stl"], {"width": 60.0, "thickness": 0.0}, "thickness"),
+        (["svg", "stl"], {"width": 60.0, "thickness": 1e9}, "thickness"),
+    ],
+)
+def test_sizes_that_make_no_sense_are_refused_and_nothing_is_written(
+    holed, tmp_path, formats, options, what
+):
+    with pytest.raises(ExportError, match=what):
+        export(*holed, tmp_path, formats, **options)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("threshold", [0.0, 1.0, -0.3, np.nan])
+def test_a_threshold_outside_0_to_1_is_refused(holed, tmp_path, threshold):
+    with pytest.raises(DesignError, match="between 0 and 1"):
+        export(*holed, tmp_path, ["vtk"], threshold=threshold)
+
+
+@pytest.mark.parametrize(("name", "package"), [("dxf", "ezdxf"), ("stl", "manifold3d")])
+def test_a_missing_extra_says_what_to_install(holed, tmp_path, monkeypatch, name, package):
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(MissingLibraryError, match=rf'{package}: pip install "mpmopt\[export\]"'):
+        export(*holed, tmp_path, ["svg", name], width=60.0)
+    assert not list(tmp_path.iterdir())
+    export(*holed, tmp_path, ["svg"], width=60.0)
+
+
+def test_a_folder_that_cannot_be_made_is_a_storage_error(holed, tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(StorageError, match="another folder"):
+        export(*holed, tmp_path / "file" / "folder", ["svg"], width=60.0)
+
+
+def run_file(path, problem, x):
+    """A run file with a design, as if it had been found."""
+    stage = Stage(problem.chain.beta, 1e-2, 1e-3, problem.scene.time_step)
+    run = begin(problem.scene, Settings((stage,)), x)
+    numbers = dict.fromkeys(("move_limit", "greyness", "projected_gradient", "step"), 0.1)
+    item = Candidate(
+        start=0, stage=0, beta=stage.beta, time_step=stage.time_step, objective=0.5,
+        seconds=1.0, x=x, gamma=problem.gamma(x), **numbers,
+    )  # fmt: skip
+    run.legs[0].best[0] = run.first = run.last = item
+    run.history.append(item)
+    runfile.write(path, run)
+    return path
+
+
+def test_the_command_writes_all_four_and_says_how_large_it_all_is(holed, tmp_path):
+    path = run_file(tmp_path / "run.h5", *holed)
+    (tmp_path / "design.svg").write_text("an older one")
+    options = ["--svg", "--dxf", "--stl", "--vtk", "--width", "60", "--drop-loose"]
+    done = subprocess.run(
+        [sys.executable, "-m", "mpmopt", "export", str(path), *options],
+        capture_output=True, text=True, timeout=120, cwd=Path(__file__).parent.parent,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    names = {file.name for file in tmp_path.iterdir()}
+    assert names == {"run.h5", "design.svg", "design.dxf", "design.stl", "motion.vtkhdf"}
+    assert (tmp_path / "design.svg").read_text().startswith("<?xml")
+    for file in ("design.svg", "design.dxf", "design.stl", "motion.vtkhdf"):
+        assert f"{tmp_path / file}  {(tmp_path / file).stat().st_size} bytes" in done.stdout
+    assert "60 x 50 mm" in done.stdout
+    assert "pieces  1, with 2 holes" in done.stdout
+    assert "particles hang on nothing, left out" in done.stdout
+    mesh = trimesh.load_mesh(str(tmp_path / "design.stl"))
+    assert mesh.bounds[1] == pytest.approx([60.0, 50.0, 6.0], abs=1e-5)
+    assert mesh.body_count == 1
+    _, frames = read_motion(tmp_path / "motion.vtkhdf")
+    assert len(frames[0]["corners"]) == round(particles_area(*holed, True) / (WIDTH / 48) ** 2)
+
+
+def test_the_command_says_what_is_missing(holed, tmp_path, capsys):
+    path = run_file(tmp_path / "run.h5", *holed)
+    assert main(["export", str(path), "--svg"]) == 1
+    assert capsys.readouterr().err.startswith("ExportError: a drawing needs a size")
+    assert main(["export", str(path), "--width", "60"]) == 1
+    assert capsys.readouterr().err.startswith("ExportError: no format is asked for")
