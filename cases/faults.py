@@ -103,7 +103,9 @@ def child(out: Path, phase: Path | None, on_disk: bool) -> int:
         simulate.together = telling(simulate.together, lambda *a: a[2].__name__)
         runfile.replace_file = telling(runfile.replace_file, lambda *a: "write")
     checkpointing = Checkpointing(every=7, store="disk") if on_disk else None
-    return case.reported(lambda: case.run(SMALL, out, checkpointing), out / "run.h5")
+    return case.reported(
+        lambda: case.table(case.run(SMALL, out, checkpointing)), case.how_to_go_on(out / "run.h5")
+    )
 
 
 class Process:
