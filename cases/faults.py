@@ -2,9 +2,9 @@
 
     python cases/faults.py --out out/faults [--quick]
 
-Each run is a small walker with two starts, a coarse stage and a solid one. It counts as survived if
-it ends, gone on with after the fault, in the same file as a run that nothing happened to, number by
-number; only the seconds differ.
+Each run is a small walker with four starts, a coarse stage and a solid one. It counts as survived
+if it ends, gone on with after the fault, in the same file as a run that nothing happened to, number
+by number; only the seconds differ.
 """
 
 from __future__ import annotations
@@ -67,14 +67,14 @@ class Row:
 
 
 def content(path: Path) -> dict[str, Any]:
-    """All that a run file holds, by name, but for the seconds and the digest, which is of them."""
+    """All that a run file holds, by name, but for the seconds."""
     found: dict[str, Any] = {}
 
     def add(name: str, item: Any) -> None:
         for key, value in item.attrs.items():
             if key == "summary":
                 value = {k: v for k, v in json.loads(value).items() if k != "seconds"}
-            if key not in ("seconds", "digest"):
+            if key != "seconds":
                 found[f"{name}@{key}"] = repr(value)
         if isinstance(item, h5py.Dataset) and name != "history/seconds":
             found[name] = item[()].tobytes() if item.dtype != object else item[()].tolist()

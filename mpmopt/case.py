@@ -26,7 +26,7 @@ from mpmopt.binary import (
     unactuated,
 )
 from mpmopt.checkpoints import Checkpointing
-from mpmopt.errors import MpmoptError, SimulationError, StorageError
+from mpmopt.errors import DesignError, MpmoptError, RunFileError, SimulationError, StorageError
 from mpmopt.files import locked, make_folder, replace_file
 from mpmopt.history import Optimisation
 from mpmopt.interrupt import Interrupted, interruptible
@@ -56,13 +56,25 @@ class Case:
         design besides the full block.
     start : mapping, optional
         First phi, a, theta and b, as `Problem.join` takes them: one number for all actuators, or
-        one for each.
+        one for each. What is left out is that of `START`.
+
+    Raises
+    ------
+    DesignError
+        If the start has another name in it.
     """
 
     scene: Scene
     settings: Settings
     drawing: Drawing
-    start: Mapping[str, Any] = field(default_factory=lambda: START)
+    start: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if unknown := set(self.start) - set(START):
+            raise DesignError(
+                f"Case: start has {', '.join(unknown)}; its names are {', '.join(START)}"
+            )
+        object.__setattr__(self, "start", {**START, **self.start})
 
 
 def _sharpening(time_step: float, stages: int, coarsening: int = 1) -> tuple[Stage, ...]:
@@ -193,7 +205,12 @@ def run(
     make_folder(out)
     with locked(path):
         if path.exists() and not force:
-            kept = runfile.read(path)
+            try:
+                kept = runfile.read(path)
+            except RunFileError as error:
+                raise RunFileError(
+                    f"{error}; choose another folder, or --force to replace it"
+                ) from error
             begun = kept.run.first.x if kept.run.first else kept.run.legs[0].x
             same = (kept.scene, kept.settings) == (case.scene, case.settings)
             if not same or not np.array_equal(begun, starts[0]):

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
+import fcntl
 import logging
 import os
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from uuid import uuid4
 
 from mpmopt.errors import StorageError
-
-try:
-    import fcntl
-except ImportError:  # no such locks on Windows
-    fcntl = None  # type: ignore[assignment]
 
 logger = logging.getLogger(__name__)
 
@@ -27,15 +24,12 @@ def replace_file(path: Path, content: bytes) -> None:
     StorageError
         If it cannot be written.
     """
-    new = None
+    new = path.with_name(f"{_unfinished(path)}{uuid4().hex}")
     try:
-        handle, name = tempfile.mkstemp(prefix=_unfinished(path), dir=path.parent)
-        new = Path(name)
-        with os.fdopen(handle, "wb") as file:
+        with new.open("xb") as file:
             file.write(content)
             file.flush()
             os.fsync(file.fileno())
-        new.chmod(0o644)
         os.replace(new, path)
     except OSError as error:
         raise StorageError(
@@ -43,7 +37,7 @@ def replace_file(path: Path, content: bytes) -> None:
             "folder"
         ) from error
     finally:
-        if new is not None:
+        with suppress(OSError):
             new.unlink(missing_ok=True)
 
 
@@ -84,16 +78,15 @@ def locked(path: Path) -> Iterator[None]:
     except OSError as error:
         raise StorageError(f"cannot open the folder of {path}: {error}") from error
     try:
-        if fcntl is not None:
-            try:
-                fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError as error:
-                raise StorageError(
-                    f"another process is at work in {path.parent}; wait for it, or choose another "
-                    "folder"
-                ) from error
-            except OSError as error:
-                logger.warning("no lock on %s: %s; start no second process there", path, error)
+        try:
+            fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise StorageError(
+                f"another process is at work in {path.parent}; wait for it, or choose another "
+                "folder"
+            ) from error
+        except OSError as error:
+            logger.warning("no lock on %s: %s; start no second process there", path, error)
         for left in path.parent.glob(f"{_unfinished(path)}*"):
             with suppress(OSError):
                 left.unlink()

@@ -129,14 +129,6 @@ class Leg:
     gave_up: bool = False
     best: dict[int, Candidate] = field(default_factory=dict)
 
-    @property
-    def merit(self) -> tuple[int, float]:
-        """What the starts are compared by: the last stage that had a design, and its best."""
-        if not self.best:
-            return -1, -np.inf
-        item = self.best[max(self.best)]
-        return item.stage, item.objective if np.isnan(item.post_processed) else item.counted
-
 
 @dataclass(frozen=True)
 class StageState:
@@ -209,8 +201,9 @@ class Optimisation:
     def result(self) -> Candidate:
         """The best evaluation on the last stage's grid.
 
-        That is the one that goes farthest without void, where stages ask for that; else the best of
-        the last stage that had one, whose projection is the sharpest.
+        That is the one that counts most (`Candidate.counted`), where stages ask for bodies without
+        void, and of audited stages where there are some; else the best of the last stage that had
+        one, whose projection is the sharpest.
 
         Raises
         ------
@@ -222,10 +215,13 @@ class Optimisation:
             raise DesignError(f"no evaluation succeeded; the last: {last}")
         stages = self.settings.stages
         grid = stages[max(self.best)].coarsening
-        return max(
-            (item for stage, item in self.best.items() if stages[stage].coarsening == grid),
-            key=lambda item: (item.counted, item.stage),
-        )
+
+        def merit(item: Candidate) -> tuple[bool, float, int]:
+            audited = stages[item.stage].audited and np.isfinite(item.counted)
+            return bool(audited), item.counted, item.stage
+
+        on_grid = (item for stage, item in self.best.items() if stages[stage].coarsening == grid)
+        return max(on_grid, key=merit)
 
     def problem(self) -> Problem:
         """The problem that `result` solves, in the time step that it was evaluated with."""

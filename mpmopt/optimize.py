@@ -259,9 +259,17 @@ def go_on(
     ------
     SceneError, StorageError
         As `optimise`.
+    DesignError
+        If its legs do not fit its settings.
     """
-    climb = _Climb(run, tuple(callbacks), checkpointing)
     stages = len(run.settings.stages)
+    for index, leg in enumerate(run.legs):
+        if leg.start != index or not 0 <= leg.stage <= stages:
+            raise DesignError(
+                f"leg {index} is of start {leg.start}, at stage {leg.stage} of {stages}: the run "
+                "was changed, take a copy of it"
+            )
+    climb = _Climb(run, tuple(callbacks), checkpointing)
     if run.stop_reason:
         return run
     scouting = run.settings.scouting if len(run.legs) > 1 else 0
@@ -269,13 +277,21 @@ def go_on(
         if leg.stage < scouting and not leg.gave_up:
             run.leg = leg.start
             climb.stages(leg, scouting)
-    run.leg = max(run.legs, key=lambda leg: leg.merit).start
+    run.leg = max(run.legs, key=lambda leg: _merit(run, leg)).start
     leg = run.legs[run.leg]
     climb.stages(leg, stages)
     reached = leg.stage + leg.gave_up
     run.stop_reason = f"Stage {reached} of {stages} was the last: {leg.reason}"
     climb.report()
     return run
+
+
+def _merit(run: Optimisation, leg: Leg) -> tuple[int, float]:
+    """What starts are compared by: the last stage that had a design, and its best."""
+    if not leg.best:
+        return -1, -np.inf
+    item = leg.best[max(leg.best)]
+    return item.stage, item.counted if run.settings.stages[item.stage].solid else item.objective
 
 
 class _Climb:
@@ -308,6 +324,11 @@ class _Climb:
             self.run.stage_state = None
             logger.info("start %d, stage %d: %s", leg.start, leg.stage, leg.reason)
             leg.stage += not leg.gave_up
+
+
+def _order(item: Iteration) -> tuple[float, float, float]:
+    """What solid designs are compared by."""
+    return item.counted, float(np.nan_to_num(item.post_processed, nan=-np.inf)), item.objective
 
 
 class _StageRun:
@@ -467,7 +488,7 @@ class _StageRun:
             return item.objective > best.objective
         if self.stage.audited and np.isnan(item.audited):
             return False
-        return (item.counted, item.objective) > (best.counted, best.objective)
+        return _order(item) > _order(best)
 
     def _without_void(
         self,

@@ -15,8 +15,8 @@ import pytest
 from walker import CASES, slanted_legs, walker
 
 from mpmopt import runfile
-from mpmopt.case import Case, ProgressBar, main, resume, run
-from mpmopt.errors import RunFileError, StorageError
+from mpmopt.case import START, Case, ProgressBar, main, resume, run
+from mpmopt.errors import DesignError, RunFileError, StorageError
 from mpmopt.optimize import Settings, Stage, optimise
 from mpmopt.problem import Problem
 
@@ -135,6 +135,12 @@ def test_a_run_of_another_case_is_never_overwritten(folder):
     assert (out / "run.h5").read_bytes() == before
 
 
+def test_a_start_is_filled_up_and_knows_its_names():
+    assert dataclasses.replace(TINY, start={"b": 0.1}).start == {**START, "b": 0.1}
+    with pytest.raises(DesignError, match="start has omega"):
+        dataclasses.replace(TINY, start={"omega": 0.1})
+
+
 def test_foreign_files_are_overwritten_only_by_force(tmp_path):
     (tmp_path / "design.png").write_text("somebody's")
     with pytest.raises(StorageError, match=r"design\.png.*--force"):
@@ -144,7 +150,7 @@ def test_foreign_files_are_overwritten_only_by_force(tmp_path):
     run(TINY, tmp_path, force=True)
     assert (tmp_path / "design.png").read_bytes().startswith(b"\x89PNG")
     (tmp_path / "run.h5").write_text("somebody's too")
-    with pytest.raises(RunFileError):
+    with pytest.raises(RunFileError, match="--force to replace it"):
         run(TINY, tmp_path)
     assert run(TINY, tmp_path, force=True)["evaluations"] == 2
 

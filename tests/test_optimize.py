@@ -9,7 +9,8 @@ from walker import walker
 
 from mpmopt import audit
 from mpmopt.errors import DesignError, SceneError, SimulationError
-from mpmopt.optimize import Settings, Stage, optimise
+from mpmopt.history import Candidate, Leg, Optimisation
+from mpmopt.optimize import Settings, Stage, go_on, optimise
 from mpmopt.problem import Problem
 
 STAGES = (Stage(0.5, 1e-2, 1e-3, 4e-3), Stage(2.0, 5e-3, 1e-3, 2e-3, solid=True))
@@ -220,6 +221,53 @@ def test_what_an_audited_stage_asks_is_what_the_audit_tells(scene, start):
     assert others[0] != others[1]
     assert run.result.post_processed == rows["as designed"].distance
     assert run.result.counted == min(run.result.audited, run.result.post_processed)
+
+
+def candidate(stage, objective, post_processed=np.nan, audited=np.nan):
+    return Candidate(
+        start=0, stage=stage, beta=1.0, time_step=1e-3, move_limit=0.1, objective=objective,
+        greyness=0.0, projected_gradient=0.0, step=0.0, seconds=0.0, x=np.zeros(1),
+        gamma=np.zeros(1), post_processed=post_processed, audited=audited,
+    )  # fmt: skip
+
+
+def test_the_result_is_never_a_design_that_no_audit_saw_if_there_is_one(scene):
+    solid = dataclasses.replace(STAGES[0], solid=True)
+    stages = (solid, dataclasses.replace(solid, audited=True))
+    best = {0: candidate(0, 0.6, 0.55), 1: candidate(1, 0.6, 0.54, 0.5)}
+    run = Optimisation(scene, Settings(stages), [Leg(0, np.zeros(1), best=best)])
+    assert run.result is best[1]
+    best[1] = candidate(1, 0.6, 0.54, -np.inf)  # it has no audit that ran
+    assert run.result is best[0]
+
+
+def test_a_start_whose_design_fails_without_void_does_not_beat_a_sound_one(
+    scene, start, monkeypatch
+):
+    problem = Problem(STAGES[0].scene(scene), STAGES[0].beta)
+    far = 1.0 if problem.value(start) > problem.value(0.5 * start) else 0.5
+    solid = dataclasses.replace(STAGES[0], solid=True)
+    settings = Settings((solid, solid), window=1, least_iterations=2, most_iterations=2, scouting=1)
+
+    def post_processed(problem, x):
+        sound = min(abs(x[-6:]).max(), 1.0)  # of the start's amplitude
+        if (sound > 0.75) == (far == 1.0):
+            raise SimulationError("made to fail", 3, 1, (0.0, 0.0), "none")
+        return 0.1
+
+    monkeypatch.setattr("mpmopt.optimize.post_processed", post_processed)
+    run = optimise(scene, settings, [start, 0.5 * start])
+    assert run.result.start == (1 if far == 1.0 else 0)
+
+
+def test_a_run_that_was_changed_is_refused(scene, start):
+    run = optimise(
+        scene, Settings(STAGES[:1], window=1, least_iterations=2, most_iterations=2), start
+    )
+    for change in ({"start": 5}, {"stage": -1}, {"stage": 2}):
+        legs = [dataclasses.replace(run.legs[0], **change)]
+        with pytest.raises(DesignError, match="run was changed"):
+            go_on(dataclasses.replace(run, legs=legs, stop_reason=""))
 
 
 def test_of_several_starts_the_best_goes_on(scene, start):

@@ -172,6 +172,16 @@ def test_a_lock_ends_and_leaves_nothing(tmp_path):
     assert sorted(item.name for item in tmp_path.iterdir()) == [".other.h5-x", "run.h5"]
 
 
+@pytest.mark.parametrize(("umask", "mode"), [(0o022, 0o644), (0o077, 0o600)])
+def test_files_are_as_private_as_the_user_has_them(tmp_path, umask, mode):
+    before = os.umask(umask)
+    try:
+        replace_file(tmp_path / "run.h5", b"1")
+    finally:
+        os.umask(before)
+    assert (tmp_path / "run.h5").stat().st_mode & 0o777 == mode
+
+
 def test_resume_of_no_run_is_an_error(tmp_path, capsys):
     command = [sys.executable, "-m", "mpmopt", "resume", str(tmp_path / "no" / "run.h5")]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
