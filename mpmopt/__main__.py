@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from mpmopt import __version__
-from mpmopt.errors import MpmoptError
+from mpmopt.errors import DesignError, MpmoptError
 from mpmopt.interrupt import Interrupted, interruptible
 
 
@@ -53,6 +53,8 @@ def film(path: Path, out: Path | None, mp4: bool, seconds: float | None) -> int:
     from mpmopt.files import make_folder
     from mpmopt.film import film as filmed
 
+    if mp4 and out is not None and out.suffix.lower() != ".mp4":
+        raise DesignError(f"--mp4 does not write {out}: leave --mp4 out, or let FILE end in .mp4")
     run = runfile.read(path)
     target = out or path.parent / ("film.mp4" if mp4 else "film.gif")
     make_folder(target.parent)
@@ -85,16 +87,16 @@ def postprocess(path: Path, threshold: float) -> int:
     import numpy as np
 
     from mpmopt import runfile
-    from mpmopt.binary import farthest, full_block, pieces, post_processed
+    from mpmopt.binary import farthest, full_block, kept, pieces, post_processed
 
     run = runfile.read(path)
     problem, x = run.problem(), run.best
+    keep = kept(problem, x, threshold)
     optimised = problem.value(x)
     value = post_processed(problem, x, threshold)
     reference = run.summary.get("reference") or farthest(
         problem.scene, full_block, problem.split(x)
     )
-    keep = problem.gamma(x) >= threshold
     sizes = np.bincount(pieces(problem.scene, keep)[keep])
     print(f"reference (full block)   {reference:.4f}")
     print(f"optimised                {optimised:.4f}")
@@ -342,7 +344,7 @@ def _parser() -> argparse.ArgumentParser:
         command.add_argument(
             f"--{name}", dest="formats", action="append_const", const=name, default=[], help=text
         )
-    command.add_argument("--width", type=float, metavar="MM", help="width of the drawing")
+    command.add_argument("--width", type=float, metavar="MM", help="width of the drawing or solid")
     command.add_argument(
         "--scale", type=float, metavar="MM", help="instead: length of the scene's unit"
     )

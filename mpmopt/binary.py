@@ -79,9 +79,30 @@ def distance(scene: Scene, keep: NDArray[np.bool_], variables: Variables) -> flo
     return float(objective.value(state))
 
 
+def kept(problem: Problem, x: NDArray, threshold: float = THRESHOLD) -> NDArray[np.bool_]:
+    """Which design particles (D,) have gamma >= threshold: post-processing leaves them.
+
+    Raises
+    ------
+    DesignError
+        If x does not fit, or the threshold is not between 0 and 1.
+    """
+    if not 0.0 < threshold < 1.0:
+        raise DesignError(f"threshold = {threshold:g} must be between 0 and 1")
+    return problem.gamma(x) >= threshold
+
+
 def post_processed(problem: Problem, x: NDArray, threshold: float = THRESHOLD) -> float:
-    """Objective L once particles with gamma >= threshold are solid and the others removed."""
-    return distance(problem.scene, problem.gamma(x) >= threshold, problem.split(x))
+    """Objective L once particles with gamma >= threshold are solid and the others removed.
+
+    Raises
+    ------
+    DesignError
+        As `kept`.
+    SimulationError
+        As `distance`.
+    """
+    return distance(problem.scene, kept(problem, x, threshold), problem.split(x))
 
 
 def unactuated(problem: Problem, x: NDArray) -> float:

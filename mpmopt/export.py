@@ -12,16 +12,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mpmopt.binary import THRESHOLD, pieces, solid_body
+from mpmopt.binary import THRESHOLD, kept, pieces
 from mpmopt.checks import number
 from mpmopt.errors import ExportError, MissingLibraryError
 from mpmopt.files import make_folder, replace_file
+from mpmopt.motion import Motion, equal_steps, solid
 from mpmopt.outline import Polygon, outline
 from mpmopt.problem import Problem
-from mpmopt.vtkhdf import motion
+from mpmopt.vtkhdf import content
 
 FILES = {"svg": "design.svg", "dxf": "design.dxf", "stl": "design.stl", "vtk": "motion.vtkhdf"}
 EXTRAS = {"dxf": "ezdxf", "stl": "manifold3d"}
+FRAMES = 101  # of a motion, unless there are fewer steps
 # Millimetres: what is smaller or larger is taken for a mistake.
 SMALLEST, LARGEST = 1e-3, 1e6
 
@@ -36,7 +38,7 @@ class Exported:
     polygons : list of Polygon
         In millimetres; empty if only the motion was written.
     loose : int
-        Particles that hang on nothing.
+        Particles of the whole body that hang on nothing (`binary.pieces`).
     """
 
     paths: tuple[Path, ...]
@@ -77,12 +79,13 @@ def export(
         Of the solid, in millimetres; a tenth of the width unless given.
     threshold : float, optional
     drop_loose : bool, optional
-        Leave out pieces that hang on nothing.
+        Leave out pieces that hang on nothing (`binary.pieces`), in drawings, solid and motion.
 
     Raises
     ------
     ExportError
-        If nothing is asked for, or a size is missing or makes no sense; nothing is written then.
+        If nothing is asked for, or a size is missing, makes no sense or has no effect; nothing is
+        written then.
     MissingLibraryError
         If ezdxf or manifold3d is needed and not installed; nothing is written then.
     DesignError, SimulationError
@@ -95,25 +98,35 @@ def export(
     if unknown or not formats:
         what = f"formats {unknown} are unknown" if unknown else "no format is asked for"
         raise ExportError(f"{what}; ask for some of {', '.join(FILES)}")
-    drawn = outline(problem, x, threshold, drop_loose)
-    piece = pieces(problem.scene, problem.gamma(x) >= threshold)
+    if thickness is not None and "stl" not in formats:
+        raise ExportError("only a solid has a thickness: ask for stl too, or give no thickness")
+    drawn = set(formats) != {"vtk"}
+    if not drawn and (width, scale) != (None, None):
+        raise ExportError(
+            "the motion is in the scene's units: ask for svg, dxf or stl too, or give neither "
+            "width nor scale"
+        )
+    keep = kept(problem, x, threshold)
+    loose = pieces(problem.scene, keep) > 0
+    if drop_loose:
+        keep &= ~loose
     polygons: list[Polygon] = []
     contents: dict[str, bytes] = {}
-    if set(formats) != {"vtk"}:
-        polygons = in_millimetres(drawn, width, scale)
+    if drawn:
+        polygons = in_millimetres(outline(problem, x, threshold, keep), width, scale)
         if thickness is None:
             thickness = 0.1 * size(polygons)[0]
         writers = {"svg": svg, "dxf": dxf, "stl": lambda sized: stl(sized, thickness)}
         contents = {name: writers[name](polygons) for name in writers if name in formats}
     if "vtk" in formats:
-        keep = piece == 0 if drop_loose else piece >= 0
-        simulation, _ = solid_body(problem.scene, keep, problem.split(x))
-        contents["vtk"] = motion(simulation)
+        frames = np.unique(equal_steps(problem.scene, FRAMES))
+        contents["vtk"] = content(Motion.of(solid("design", problem, x, keep), frames))
     make_folder(out)
-    for name, content in contents.items():
-        replace_file(out / FILES[name], content)
+    for name, written in contents.items():
+        replace_file(out / FILES[name], written)
     paths = tuple(out / FILES[name] for name in contents)
-    return Exported(paths, polygons, int((piece > 0).sum()))
+    halves = 1 if problem.scene.mirror is None else 2
+    return Exported(paths, polygons, halves * int(loose.sum()))
 
 
 def size(polygons: Sequence[Polygon]) -> NDArray[np.float64]:

@@ -1,4 +1,4 @@
-"""Bodies at several instants, as pictures and films show them."""
+"""Bodies at several instants, as pictures, films and exported motions show them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mpmopt.binary import THRESHOLD, full_block, solid_body
+from mpmopt.binary import full_block, kept, solid_body
 from mpmopt.objective import Objective
 from mpmopt.problem import Problem
 from mpmopt.scene import Mirror, Scene
@@ -58,17 +58,18 @@ def optimised(problem: Problem, x: NDArray[np.float64]) -> Body:
 
 def post_processed(problem: Problem, x: NDArray[np.float64]) -> Body:
     """A design without grey: what has gamma >= 0.3 is solid, the rest is removed."""
-    keep = problem.gamma(x) >= THRESHOLD
-    return _solid("post-processed design", problem, x, keep)
+    keep = kept(problem, x)
+    return solid("post-processed design", problem, x, keep)
 
 
 def reference(problem: Problem, x: NDArray[np.float64]) -> Body:
     """The reference design, a full block, with the actuation of a design."""
     keep = full_block(problem.particles.position[problem.particles.designed])
-    return _solid("full block, same actuation", problem, x, keep)
+    return solid("full block, same actuation", problem, x, keep)
 
 
-def _solid(name: str, problem: Problem, x: NDArray[np.float64], keep: NDArray[np.bool_]) -> Body:
+def solid(name: str, problem: Problem, x: NDArray[np.float64], keep: NDArray[np.bool_]) -> Body:
+    """The body of which only the design particles in `keep` (D,) are there, all of them solid."""
     simulation, _ = solid_body(problem.scene, keep, problem.split(x))
     return Body(name, simulation, np.ones(len(simulation.particles.position)))
 
@@ -84,12 +85,15 @@ class Motion:
     frames : (F,) array of int
         Steps that were made before each instant.
     position : (F, 2, M) array
+    velocity : (F, 2, M) array
     deformation : (F, 4, M) array
         Deformation gradient, row by row.
     gamma : (M,) array
         Material density.
     actuation : (F, M) array
-        Signal divided by the largest of all; zero outside actuators.
+        Signal divided by `largest`; zero outside actuators.
+    largest : float
+        Largest size of all signals from start to end; 1 if there is none.
     objective : (F,) array
         L, as if the motion ended there.
     """
@@ -98,9 +102,11 @@ class Motion:
     scene: Scene
     frames: NDArray[np.int64]
     position: NDArray[np.float32]
+    velocity: NDArray[np.float32]
     deformation: NDArray[np.float32]
     gamma: NDArray[np.float64]
     actuation: NDArray[np.float32]
+    largest: float
     objective: NDArray[np.float64]
 
     @classmethod
@@ -122,7 +128,7 @@ class Motion:
             states = np.array([with_image(state, scene.mirror) for state in states])
             gamma, actuator = np.tile(gamma, 2), np.tile(actuator, 2)
         signal = np.real(simulation.signal)[np.minimum(frames, scene.steps - 1)]
-        largest = np.abs(simulation.signal).max(initial=0.0) or 1.0
+        largest = float(np.abs(simulation.signal).max(initial=0.0)) or 1.0
         actuation = np.zeros((len(frames), len(gamma)), np.float32)
         actuation[:, actuator >= 0] = signal[:, actuator[actuator >= 0]] / largest
         return cls(
@@ -130,9 +136,11 @@ class Motion:
             scene=scene,
             frames=frames,
             position=states[:, 0:2].astype(np.float32),
+            velocity=states[:, 2:4].astype(np.float32),
             deformation=states[:, 8:12].astype(np.float32),
             gamma=gamma,
             actuation=actuation,
+            largest=largest,
             objective=np.array(values),
         )
 

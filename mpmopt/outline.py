@@ -9,10 +9,9 @@ import numpy as np
 from matplotlib.path import Path
 from numpy.typing import NDArray
 
-from mpmopt.binary import THRESHOLD
+from mpmopt.binary import THRESHOLD, kept
 from mpmopt.design import filter_matrix
-from mpmopt.errors import DesignError
-from mpmopt.particles import lay_out
+from mpmopt.particles import lay_out, mirror_images
 from mpmopt.problem import Problem
 
 # The filtered design is sampled at so many intervals per particle spacing.
@@ -57,13 +56,14 @@ def outline(
     problem: Problem,
     x: NDArray[np.float64],
     threshold: float = THRESHOLD,
-    drop_loose: bool = False,
+    keep: NDArray[np.bool_] | None = None,
 ) -> list[Polygon]:
     """Where a design is solid: gamma >= threshold, and all regions that are not designed.
 
     Gamma is a monotonic function of the filtered design, and this a smooth function of position,
     not of particles only. So the outline is one of its level lines, which passes between particles
-    that stay and particles that go. At the edges of regions it is cut straight.
+    that stay and particles that go. At the edges of regions it is cut straight. What holds no
+    particle is not drawn.
 
     Parameters
     ----------
@@ -71,8 +71,8 @@ def outline(
     x : (n,) array
     threshold : float, optional
         Of gamma, between 0 and 1.
-    drop_loose : bool, optional
-        Leave out the pieces that hold to no solid region.
+    keep : (D,) array of bool, optional
+        Design particles that may be drawn; the others are cut out, each with its square.
 
     Returns
     -------
@@ -84,15 +84,21 @@ def outline(
     DesignError
         If x does not fit, or the threshold makes no sense.
     """
-    if not 0.0 < threshold < 1.0:
-        raise DesignError(f"threshold = {threshold:g} must be between 0 and 1")
+    solid = kept(problem, x, threshold)
+    drawn = solid if keep is None else solid & keep
     phi, beta = problem.split(x).phi, problem.chain.beta
     level = np.arctanh((2.0 * threshold - 1.0) * np.tanh(beta)) / beta
-    scene = problem.scene
+    scene, particles = problem.scene, problem.particles
     spacing = scene.grid.dx / scene.particles_per_cell
     body = lay_out(scene, whole=True)
     cell = np.floor(body.position / spacing).astype(int)
     low, high = cell.min(axis=0) - 1, cell.max(axis=0) + 2
+    image = mirror_images(scene, particles, body)
+
+    def of_all(designed: NDArray[np.bool_], others: bool) -> NDArray[np.bool_]:
+        values = np.full(len(particles.position), others)
+        values[particles.designed] = designed
+        return values[image]
 
     # Every particle's cell is sampled with both its edges, so that edges between cells are there
     # twice and what differs on their two sides changes over no distance.
@@ -102,6 +108,8 @@ def outline(
     empty = np.full(high - low, OUTSIDE)
     i, j = (cell - low).T
     empty[i, j] = np.where(body.designed, np.nan, SOLID)
+    cut = of_all(solid & ~drawn, False)
+    empty[i[cut], j[cut]] = OUTSIDE
     field = samples(empty)
     lines = [
         np.add.outer(np.arange(low[k], high[k]), np.arange(SAMPLES + 1) / SAMPLES).ravel()
@@ -109,19 +117,18 @@ def outline(
     ]
     row, column = np.nonzero(np.isnan(field))
     points = np.stack([lines[0][row], lines[1][column]], axis=1) * spacing
-    field[row, column] = filter_matrix(scene, problem.particles, points) @ phi
+    field[row, column] = filter_matrix(scene, particles, points) @ phi
 
     contours = contourpy.contour_generator(
         lines[0] * GRAIN, lines[1] * GRAIN, field.T, fill_type=contourpy.FillType.OuterOffset
     )
+    centres = body.position[of_all(drawn, True)]
     polygons = []
     for coordinates, offsets in zip(*contours.filled(level, 2.0 * SOLID), strict=True):
         rings = [_tidy(ring) * (spacing / GRAIN) for ring in np.split(coordinates, offsets[1:-1])]
-        if len(rings[0]):
-            polygons.append(Polygon(tuple(ring for ring in rings if len(ring))))
-    if drop_loose:
-        solid = body.position[~body.designed]
-        polygons = [polygon for polygon in polygons if polygon.contains(solid).any()]
+        polygon = Polygon(tuple(ring for ring in rings if len(ring)))
+        if len(rings[0]) and polygon.contains(centres).any():
+            polygons.append(polygon)
     return sorted(polygons, key=lambda polygon: -polygon.area)
 
 

@@ -36,9 +36,11 @@ def made_up(position, deformation, gamma, actuation):
         scene=small_scene(),
         frames=np.array([0]),
         position=np.array(position, np.float32).reshape(count, 2).T[None],
+        velocity=np.zeros((1, 2, count), np.float32),
         deformation=np.array(deformation, np.float32).reshape(count, 4).T[None],
         gamma=np.array(gamma, float),
         actuation=np.array(actuation, np.float32)[None],
+        largest=1.0,
         objective=np.zeros(1),
     )
 

@@ -147,7 +147,8 @@ def test_a_loose_ring_around_what_is_solid_is_dropped():
     ring = discs(problem, (16, 16, 7), inside=1.0)
     x = np.minimum(ring, discs(problem, (16, 16, 4.5)))
     assert [len(polygon.rings) for polygon in outline(problem, x)] == [2, 1]
-    (left,) = outline(problem, x, drop_loose=True)
+    held = pieces(problem.scene, problem.gamma(x) >= 0.3) == 0
+    (left,) = outline(problem, x, keep=held)
     assert left.area == pytest.approx(16 * C**2)
 
 
@@ -285,10 +286,50 @@ def test_the_motion_is_read_back_by_vtk(tmp_path, mirror):
         expected = np.where(actuator >= 0, simulation.signal[min(step, 39)][actuator], 0.0)
         assert frame["signal"][:count] == pytest.approx(expected, abs=1e-6)
         if mirror:
+            velocity = frame["velocity"][count:, :2] * (1.0, -1.0)
+            assert velocity == pytest.approx(frame["velocity"][:count, :2], abs=1e-6)
+            assert np.array_equal(frame["signal"][count:], frame["signal"][:count])
             image = centre[count:, :2] * (1.0, -1.0) + (0.0, 2 * scene.mirror.position)
             assert image == pytest.approx(centre[:count, :2], abs=1e-6)
             areas = np.array(areas)
             assert areas[count:] == pytest.approx(areas[:count], rel=1e-3)
+
+
+@pytest.mark.parametrize("seed", [2, 4, 7])
+def test_drawing_motion_and_count_agree_on_what_is_loose(tmp_path, seed):
+    """Ragged designs, whose outlines part and join what neighbours on the lattice do not."""
+    problem = Problem(block(), beta=8.0)
+    x = np.random.default_rng(seed).choice([-1.0, 1.0], size=problem.size)
+    done = export(problem, x, tmp_path, ["svg", "vtk"], scale=1.0, drop_loose=True)
+    _, frames = read_motion(tmp_path / "motion.vtkhdf")
+    moving = frames[0]["corners"].mean(axis=1)[:, :2]
+    position = problem.particles.position
+    distance, index = KDTree(position).query(moving)
+    assert distance.max() <= 1e-6
+    there = np.zeros(len(position), dtype=bool)
+    there[index] = True
+    gamma = np.ones(len(position))
+    gamma[problem.particles.designed] = problem.gamma(x)
+    assert done.loose == (gamma >= 0.3).sum() - len(moving) >= 100
+    upper = np.max([polygon.rings[0].max(axis=0) for polygon in done.polygons], axis=0)
+    shift = upper - (28 * C, 24 * C)  # the bar's corner
+    inside = [polygon.contains(position + shift) for polygon in done.polygons]
+    clear = np.abs(gamma - 0.3) > 1e-2  # void on the line may be on either side
+    drawn = np.any(inside, axis=0)
+    assert np.array_equal(drawn[clear | there], there[clear | there])
+    assert not drawn[(gamma >= 0.3) & ~there].any()
+    assert np.all([(one & there).any() for one in inside])
+
+
+def test_of_a_mirror_scene_all_loose_particles_are_counted(tmp_path):
+    problem = Problem(dataclasses.replace(crawler(64, 8e-4), steps=1), beta=8.0)
+    rng = np.random.default_rng(1)
+    x = problem.join(rng.choice([-1.0, 1.0], size=problem.size - 3), 1.0, -0.3, -0.5)
+    counts = []
+    for drop in (False, True):
+        done = export(problem, x, tmp_path, ["vtk"], drop_loose=drop)
+        counts.append(len(read_motion(tmp_path / "motion.vtkhdf")[1][0]["corners"]))
+    assert done.loose == counts[0] - counts[1] >= 2
 
 
 @pytest.mark.parametrize(
@@ -306,6 +347,9 @@ def test_the_motion_is_read_back_by_vtk(tmp_path, mirror):
         (["stl"], {"scale": 1e9}, "choose another size"),
         (["stl"], {"width": 60.0, "thickness": 0.0}, "thickness"),
         (["svg", "stl"], {"width": 60.0, "thickness": 1e9}, "thickness"),
+        (["vtk"], {"width": 60.0}, "ask for svg, dxf or stl too"),
+        (["vtk"], {"scale": 80.0}, "neither width nor scale"),
+        (["svg", "dxf", "vtk"], {"width": 60.0, "thickness": 3.0}, "ask for stl too"),
     ],
 )
 def test_sizes_that_make_no_sense_are_refused_and_nothing_is_written(
@@ -382,3 +426,8 @@ def test_the_command_says_what_is_missing(holed, tmp_path, capsys):
     assert capsys.readouterr().err.startswith("ExportError: a drawing needs a size")
     assert main(["export", str(path), "--width", "60"]) == 1
     assert capsys.readouterr().err.startswith("ExportError: no format is asked for")
+    assert main(["export", str(path), "--vtk", "--width", "5"]) == 1
+    assert "ask for svg, dxf or stl too" in capsys.readouterr().err
+    assert main(["export", str(path), "--svg", "--width", "5", "--thickness", "3"]) == 1
+    assert "ask for stl too" in capsys.readouterr().err
+    assert [file.name for file in tmp_path.iterdir()] == ["run.h5"]

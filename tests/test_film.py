@@ -181,6 +181,13 @@ def test_another_ending_is_refused(short_run, tmp_path, name):
         film(tmp_path / name, short_run)
 
 
+def test_an_option_and_a_name_that_disagree_are_refused(short_path, tmp_path, capsys):
+    target = tmp_path / "walker.gif"
+    assert main(["film", str(short_path), "--mp4", "--out", str(target)]) == 1
+    assert capsys.readouterr().err.startswith(f"DesignError: --mp4 does not write {target}")
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize("seconds", [0.0, -1.0, 0.05, float("nan"), float("inf"), 1e9])
 def test_a_length_that_makes_no_sense_is_refused(short_run, tmp_path, seconds):
     with pytest.raises(DesignError, match="seconds"):

@@ -12,6 +12,7 @@ import pytest
 from conftest import small_scene
 
 from mpmopt import runfile
+from mpmopt.__main__ import main
 from mpmopt.binary import post_processed
 from mpmopt.errors import RunFileError, StorageError
 from mpmopt.optimize import Settings, Stage, optimise
@@ -284,6 +285,14 @@ def test_postprocess_prints_the_share_of_the_gain_kept(run, path):
     assert f"{(problem.gamma(run.result.x) >= 0.4).sum()} of 32" in done.stdout
     assert "share of the gain kept" in done.stdout
     assert "hanging on nothing" in done.stdout
+
+
+@pytest.mark.parametrize("threshold", ["nan", "2", "0", "-1"])
+def test_postprocess_refuses_a_threshold_that_makes_no_sense(path, capsys, threshold):
+    assert main(["postprocess", str(path), "--threshold", threshold]) == 1
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert said.err == f"DesignError: threshold = {threshold} must be between 0 and 1\n"
 
 
 def test_an_unknown_command_is_not_understood():
