@@ -197,7 +197,8 @@ def optimise(
     """Maximise the distance travelled, stage by stage.
 
     An evaluation that fails steps back to the stage's farthest design and halves the move limit,
-    which then recovers slowly. A stage of which no design ran yet halves its time step instead.
+    which then recovers slowly. A stage of which no design ran yet takes the best of the one before,
+    and if that fails too, halves its time step.
 
     Parameters
     ----------
@@ -394,6 +395,9 @@ class _StageRun:
         """The design to evaluate after x."""
         mma = self.mma
         if self.failures and self.farthest is None:
+            spare = self._best_before()
+            if spare is not None and not np.array_equal(spare, x):
+                return spare
             scene = self.problem.scene
             logger.warning("no design of this stage ran yet: time step %g halved", scene.time_step)
             self._pose(scene.time_step / 2.0)
@@ -406,6 +410,11 @@ class _StageRun:
         factor = SHORTEN if went_back and self.run.settings.adapt_move_limit else LENGTHEN
         mma.move_limit = min(self.stage.move_limit, factor * mma.move_limit)
         return mma.step(x, -self.values[-1], -self.gradient)
+
+    def _best_before(self) -> NDArray[np.float64] | None:
+        """The best design of the stage before, if it is of the same grid."""
+        before = self.run.best.get(self.leg.stage - 1)
+        return before.x if before is not None and before.x.size == self.problem.size else None
 
     def _evaluate(self, x: NDArray[np.float64]) -> None:
         """Value and gradient, recorded, even of a simulation that failed."""

@@ -147,6 +147,22 @@ def test_a_stage_whose_first_design_fails_halves_its_step(scene, start, monkeypa
     assert run.failed_evaluations == 2
 
 
+def test_a_stage_whose_first_design_fails_takes_the_best_of_the_one_before(
+    scene, start, monkeypatch
+):
+    without_void = iter((0.4, 0.1, 0.2))  # so that the best is not the farthest
+    monkeypatch.setattr("mpmopt.optimize.post_processed", lambda problem, x: next(without_void))
+    calls = fail_on(monkeypatch, {3, 4})
+    stages = (dataclasses.replace(STAGES[0], solid=True), dataclasses.replace(STAGES[0], beta=2.0))
+    settings = Settings(stages, window=1, least_iterations=3, most_iterations=3)
+    run = optimise(scene, settings, start)
+    farthest = max(run.history[:3], key=lambda item: item.objective)
+    assert farthest.objective > run.best[0].objective
+    assert not np.array_equal(calls[3][1], run.best[0].x)
+    assert [step for step, _ in calls[3:6]] == [4e-3, 4e-3, 2e-3]
+    assert all(np.array_equal(x, run.best[0].x) for _, x in calls[4:6])
+
+
 def test_repeated_failure_gives_up_with_everything_kept(scene, start, monkeypatch):
     fail_on(monkeypatch, set(range(6, 1000)))
     run = optimise(scene, dataclasses.replace(QUICK, most_failures=4), start)
