@@ -100,16 +100,16 @@ def test_a_signal_ends_a_run_with_its_code_and_says_how_to_go_on(whole, tmp_path
 
 
 HANGS = """
-import ctypes, sys
+import ctypes
 from mpmopt.interrupt import interruptible
 with interruptible("Advice."):
-    mutex = ctypes.create_string_buffer(64)
-    print("ready", flush=True)
-    while True:  # the second lock waits for ever, whatever the signal
-        try:
-            ctypes.CDLL(None).pthread_mutex_lock(mutex)
-        except KeyboardInterrupt:  # came before it
-            pass
+    mutex, library = ctypes.create_string_buffer(64), ctypes.CDLL(None)
+    library.pthread_mutex_lock(mutex)
+    try:
+        print("ready", flush=True)
+        library.pthread_mutex_lock(mutex)  # waits for ever, whatever the signal
+    except KeyboardInterrupt:  # came before it
+        library.pthread_mutex_lock(mutex)
 """
 
 
