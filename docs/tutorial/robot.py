@@ -25,5 +25,7 @@ def all_there(positions):
     return positions[:, 0] > 0.0
 
 
+CASE = Case(worm, sharpened(8e-4), all_there)
+
 if __name__ == "__main__":
-    sys.exit(main("A worm.", {"default": Case(worm, sharpened(8e-4), all_there)}))
+    sys.exit(main("A worm.", {"default": CASE}))
