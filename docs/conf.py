@@ -41,6 +41,8 @@ autodoc_default_options = {"members": True}
 numpydoc_show_class_members = False
 
 html_theme = "furo"
+html_static_path = ["_static"]
+html_css_files = ["mpmopt.css"]
 html_title = f"mpmopt {version}"
 html_show_copyright = False
 html_show_sphinx = False
