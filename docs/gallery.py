@@ -10,11 +10,10 @@ import io
 import sys
 from pathlib import Path
 
-DOCS = Path(__file__).resolve().parent
-ROOT = DOCS.parent
-OUT = DOCS / "_gallery"
-sys.path[:0] = [str(ROOT / "cases"), str(DOCS / "tutorial")]
-sys.path.append(str(ROOT))  # where mpmopt is not installed
+sys.path.append(str(Path(__file__).parent / "tutorial"))
+sys.path.append(str(Path(__file__).parent.parent / "cases"))
+# An installed package comes first; the working copy serves where there is none.
+sys.path.append(str(Path(__file__).parent.parent))
 
 import climber
 import crawler
@@ -32,6 +31,7 @@ from mpmopt.plot import plot_motion
 from mpmopt.problem import Problem
 from mpmopt.progress import Progress
 
+OUT = Path(__file__).parent / "_gallery"
 CASES = {
     "walker": (walker, walker.CASES["preview"]),
     "crawler": (crawler, crawler.CASES["preview"]),
@@ -45,6 +45,7 @@ ROWS = {
     "reference_drawn": "Drawn by hand",
     "optimised": "Optimised",
     "post_processed": "Post-processed",
+    "actuation_off": "The same with its actuation off",
     "gain_kept": "Gain kept with half the step; twice the step; finer cells",
     "loose_particles": "Loose particles",
     "evaluations": "Evaluations",

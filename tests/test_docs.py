@@ -1,4 +1,4 @@
-"""The pages: built with warnings as errors, links within them, doctests, and what they must hold."""
+"""The pages: built with warnings as errors, links, doctests, and what they must hold."""
 
 import re
 import shutil
@@ -110,6 +110,12 @@ def test_every_page_is_in_one_group_of_the_contents():
     listed = re.findall(r"^   (\w+)$", text, re.MULTILINE)
     written = {path.stem for end in ("rst", "md") for path in DOCS.glob(f"*.{end}")} - {"index"}
     assert sorted(listed) == sorted(written)
+
+
+def test_no_page_has_a_table_of_contents_of_its_own(pages):
+    # The theme shows one beside the page, and an error in red in the place of another.
+    for page in pages.glob("*.html"):
+        assert 'class="contents' not in page.read_text(), page.name
 
 
 def test_every_equation_of_the_theory_is_numbered():
