@@ -48,10 +48,11 @@ def plot_motion(path: Path, body: Body, pictures: int = 8) -> None:
     """
     motion = Motion.of(body, equal_steps(body.simulation.scene, pictures))
     box = view([motion])
-    columns = 2 if pictures > 1 else 1
-    rows = -(-pictures // columns)
     width, height = box[1] - box[0]
-    figure = new_figure(5.0 * columns, (5.0 * height / width + 0.35) * rows + 0.4)
+    columns, wide = (2, 5.0) if height < 1.25 * width else (4, 2.5)  # inches of a panel
+    columns = min(columns, pictures)
+    rows = -(-pictures // columns)
+    figure = new_figure(wide * columns, (wide * height / width + 0.35) * rows + 0.4)
     name = body.name[0].upper() + body.name[1:]
     figure.suptitle(f"{name}, L = {motion.objective[-1]:.3f}")
     panels = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).ravel()

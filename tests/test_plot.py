@@ -15,8 +15,10 @@ from mpmopt import draw, files, plot, runfile
 from mpmopt.__main__ import main
 from mpmopt.errors import RunFileError, SimulationError, StorageError
 from mpmopt.history import Iteration
+from mpmopt.motion import optimised
 from mpmopt.optimize import optimise
 from mpmopt.problem import Problem
+from mpmopt.scene import Design, Solid
 from mpmopt.schematic import schematic
 
 NAMES = {"schematic.png", "history.png", "design.png", "post_processed.png", "reference.png"}
@@ -177,3 +179,13 @@ def test_a_run_that_failed_says_how():
     kept = runfile.RunFile(run, {})
     with pytest.raises(RunFileError, match=r"no design: .* last one failed: step 3: it burst"):
         _ = kept.best
+
+
+def test_instants_of_a_tall_body_stand_in_one_row(tmp_path):
+    c = 1 / 16
+    body = (Design((6 * c, 2 * c), (9 * c, 12 * c)), Solid((6 * c, 12 * c), (9 * c, 14 * c)))
+    tall = small_scene(body=body, walls=(), steps=3)
+    problem = Problem(tall)
+    plot.plot_motion(tmp_path / "a.png", optimised(problem, problem.join(1.0, [], [], [])), 4)
+    height, width, _ = picture((tmp_path / "a.png").read_bytes()).shape
+    assert height < width  # two rows would be three times as high as wide

@@ -7,15 +7,15 @@ from mpmopt.scene import Actuator, Design, Grid, Scene, Wall
 
 c = 1 / 64  # width of a cell
 worm = Scene(
-    grid=Grid(cells=(96, 32), dx=c),
+    grid=Grid(cells=(128, 32), dx=c),
     time_step=8e-4,
     steps=1250,  # one second
     gravity=(0.0, -10.0),
     walls=(Wall("y", 4 * c, friction=0.5),),
     body=(
-        Design((4 * c, 4 * c), (28 * c, 9 * c)),
-        Actuator((4 * c, 9 * c), (16 * c, 12 * c)),
+        Design((16 * c, 4 * c), (40 * c, 9 * c)),
         Actuator((16 * c, 9 * c), (28 * c, 12 * c)),
+        Actuator((28 * c, 9 * c), (40 * c, 12 * c)),
     ),
 )
 
@@ -25,5 +25,7 @@ def all_there(positions):
     return positions[:, 0] > 0.0
 
 
+CASE = Case(worm, sharpened(8e-4), all_there)
+
 if __name__ == "__main__":
-    sys.exit(main("A worm.", {"default": Case(worm, sharpened(8e-4), all_there)}))
+    sys.exit(main("A worm.", {"default": CASE}))

@@ -1,0 +1,103 @@
+"""Runs the cases at a small size and leaves pictures, films and numbers for the gallery.
+
+    python docs/gallery.py
+
+Sphinx calls this before it reads the pages. What is newer than its sources is left as it is.
+"""
+
+import csv
+import io
+import sys
+from pathlib import Path
+
+sys.path.append(str(Path(__file__).parent / "tutorial"))
+sys.path.append(str(Path(__file__).parent.parent / "cases"))
+# An installed package comes first; the working copy serves where there is none.
+sys.path.append(str(Path(__file__).parent.parent))
+
+import climber
+import crawler
+import robot
+import walker
+
+import mpmopt
+from mpmopt import runfile
+from mpmopt.case import Case, drawn, summarise
+from mpmopt.files import make_folder, replace_file
+from mpmopt.film import film
+from mpmopt.motion import post_processed
+from mpmopt.optimize import Settings, Stage, optimise
+from mpmopt.plot import plot_motion
+from mpmopt.problem import Problem
+from mpmopt.progress import Progress
+
+OUT = Path(__file__).parent / "_gallery"
+CASES = {
+    "walker": (walker, walker.CASES["preview"]),
+    "crawler": (crawler, crawler.CASES["preview"]),
+    "climber": (climber, climber.CASES["preview"]),
+    "worm": (robot, robot.CASE),
+}
+SECONDS = 4.0  # of a film
+ROWS = {
+    "start": "Start, grey all over",
+    "reference": "Full block",
+    "reference_drawn": "Drawn by hand",
+    "optimised": "Optimised",
+    "post_processed": "Post-processed",
+    "actuation_off": "The same with its actuation off",
+    "gain_kept": "Gain kept with half the step; twice the step; finer cells",
+    "loose_particles": "Loose particles",
+    "evaluations": "Evaluations",
+    "failed_evaluations": "Failed evaluations",
+}
+
+
+def small(time_step: float) -> Settings:
+    """Three stages of twelve evaluations."""
+    stages = tuple(
+        Stage(beta, mass_floor=1e-2, stiffness_floor=1e-3, time_step=time_step, solid=beta > 4.0)
+        for beta in (1.0, 4.0, 16.0)
+    )
+    return Settings(stages, least_iterations=1, most_iterations=12, tolerance=0.0)
+
+
+def make(name: str, case: Case) -> None:
+    """Optimise a case and write its picture, film and numbers."""
+    settings = small(case.scene.time_step)
+    first = settings.stages[0]
+    start = Problem(first.scene(case.scene), first.beta).join(**case.start)
+    result = optimise(case.scene, settings, start)
+    summary = summarise(result, drawn(Case(case.scene, settings, case.drawing)))
+    path = OUT / f"{name}.h5"
+    runfile.write(path, result, summary)
+    film(OUT / f"{name}.gif", runfile.read(path), SECONDS)
+    plot_motion(OUT / f"{name}.png", post_processed(result.problem(), result.result.x), 4)
+    table = io.StringIO()
+    csv.writer(table).writerows((label, text(summary[key])) for key, label in ROWS.items())
+    replace_file(OUT / f"{name}.csv", table.getvalue().encode())  # last: says that all is there
+
+
+def text(value: object) -> str:
+    """A value of a summary as the table shows it."""
+    if isinstance(value, dict):
+        return "; ".join("none" if v is None else f"{v:.0%}" for v in value.values())
+    return f"{value:.3f}" if isinstance(value, float) else str(value)
+
+
+def main() -> None:
+    """Make what is missing or older than the package or its own case."""
+    package = list(Path(mpmopt.__file__).parent.glob("*.py"))
+    make_folder(OUT)
+    with Progress("cases of the gallery", len(CASES)) as progress:
+        for name, (module, case) in CASES.items():
+            sources = [Path(__file__), Path(module.__file__), *package]
+            newest = max(source.stat().st_mtime for source in sources)
+            done = OUT / f"{name}.csv"
+            if not done.exists() or done.stat().st_mtime < newest:
+                make(name, case)
+            progress.step(name)
+
+
+if __name__ == "__main__":
+    main()
