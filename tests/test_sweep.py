@@ -1,5 +1,6 @@
 """Sweeps: each point once, in local processes and on a real Dask cluster, whoever is killed."""
 
+import fcntl
 import functools
 import os
 import subprocess
@@ -345,10 +346,10 @@ def test_no_reader_ever_sees_half_a_file(store):
         return {}
 
     with ThreadPoolExecutor(1) as executor:
-        results(sweep(look, points(60), store, executor))
-    assert len(seen) == 60
+        results(sweep(look, points(30), store, executor))
+    assert len(seen) == 30
     assert seen == sorted(seen)
-    assert seen[-1] <= 59
+    assert seen[-1] <= 29
 
 
 def test_readers_and_sweeps_do_not_wait_for_each_other(store, threads):
@@ -357,7 +358,8 @@ def test_readers_and_sweeps_do_not_wait_for_each_other(store, threads):
         assert len(read(store)) == 2
         assert squares(sweep(square, points(3), store, threads)) == {0: 0, 1: 1, 2: 4}
         assert len(held["points"]) == 2
-    with h5py.File(store, "r+"):  # with the lock of one who writes
+    with store.open("rb") as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
         assert len(read(store)) == 3
 
 
