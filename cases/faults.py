@@ -11,10 +11,8 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import csv
 import dataclasses
 import fcntl
-import io
 import json
 import os
 import random
@@ -37,6 +35,7 @@ from mpmopt import case, runfile, simulate
 from mpmopt.checkpoints import Checkpointing
 from mpmopt.files import replace_file
 from mpmopt.optimize import Settings, Stage
+from mpmopt.sweeps import as_csv
 
 SMALL = case.Case(
     dataclasses.replace(walker(64, 8e-4), steps=400),
@@ -374,15 +373,6 @@ def campaign(folder: Path, quick: bool) -> list[Row]:
     return rows
 
 
-def as_csv(rows: list[Row]) -> str:
-    """The table."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(field.name for field in dataclasses.fields(Row))
-    writer.writerows(dataclasses.astuple(row) for row in rows)
-    return text.getvalue()
-
-
 def main(argv: list[str] | None = None) -> int:
     """Run the campaign and print its table; 1 if anything was not survived."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -397,7 +387,7 @@ def main(argv: list[str] | None = None) -> int:
     arguments.out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=arguments.out, ignore_cleanup_errors=True) as folder:
         rows = campaign(Path(folder), arguments.quick)
-    table = as_csv(rows)
+    table = as_csv([dataclasses.asdict(row) for row in rows])
     replace_file(arguments.out / "faults.csv", table.encode())
     print(table, end="")
     lost = sum(row.done - row.survived for row in rows)

@@ -37,6 +37,7 @@ from mpmopt.history import Optimisation
 from mpmopt.optimize import Settings, Stage, go_on, optimise
 from mpmopt.problem import Problem
 from mpmopt.scene import Actuator, Design, Grid, Material, Mirror, Scene, Solid, Wall
+from mpmopt.seals import sealed
 
 MEMORY = 4 * 10**9  # bytes of address space above what a process has when it starts
 SECONDS = 60  # of one input
@@ -448,7 +449,7 @@ def damage(content: bytes, kind: str, how: Any, path: Path) -> None:
         path.write_bytes(content)
         with h5py.File(path, "r+") as file:
             CHANGES[how](file)
-        path.write_bytes(runfile.sealed(path.read_bytes()))
+        path.write_bytes(sealed(path.read_bytes()))
         return
     changed = bytearray(content)
     for share, by in how:

@@ -7,14 +7,11 @@ Writes ``stability_*.csv``, one table for each map, ``stability.rst``, which sum
 """
 
 import argparse
-import csv
 import datetime
-import io
 import logging
 import os
 import platform
 import sys
-from collections.abc import Sequence
 from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any
@@ -38,7 +35,7 @@ from stability.common import Found
 
 from mpmopt.errors import MpmoptError
 from mpmopt.files import replace_file
-from mpmopt.sweeps import connected, results, sweep
+from mpmopt.sweeps import as_csv, connected, results, sweep
 
 MODULES = {
     "time_step": time_step, "weak": weak, "adversary": adversary, "actuation": actuation,
@@ -47,31 +44,30 @@ MODULES = {
 }  # fmt: skip
 
 
-def as_csv(rows: Sequence[dict[str, Any]]) -> str:
-    """Rows as comma-separated values, numbers with six digits."""
-    text = io.StringIO()
-    writer = csv.DictWriter(text, rows[0], lineterminator="\n")
-    writer.writeheader()
-    for row in rows:
-        writer.writerow({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()})
-    return text.getvalue()
-
-
 def one(module: str, function: str, arguments: dict[str, Any]) -> dict[str, Any]:
-    """One row of one map."""
+    """One row of one map, and when and on what it was measured."""
     logging.getLogger("mpmopt").setLevel(logging.ERROR)  # failed evaluations are the point
-    return getattr(MODULES[module], function)(**arguments)
+    return {
+        **getattr(MODULES[module], function)(**arguments),
+        "measured_on": str(datetime.date.today()),
+        "measured_with": f"{os.cpu_count()} cores of {processor()}, "
+        f"Python {platform.python_version()}",
+    }
 
 
-def measure(quick: bool, store: Path, executor: Executor | None = None) -> Found:
-    """The points of all modules in one sweep, and what each module makes of its own."""
+def measure(quick: bool, store: Path, executor: Executor | None = None) -> tuple[Found, str]:
+    """What each module makes of its points, all in one sweep, and when and on what they ran."""
     points = [
         {"module": name, "function": function.__name__, "arguments": arguments}
         for name, module in MODULES.items()
         for function, rows in module.points(quick).items()
         for arguments in rows
     ]
-    rows = iter(results(sweep(one, points, store, executor)))
+    measured = results(sweep(one, points, store, executor))
+    days, machines = (
+        sorted({row.pop(name) for row in measured}) for name in ("measured_on", "measured_with")
+    )
+    rows = iter(measured)
     found = Found()
     for module in MODULES.values():
         part = module.measure(
@@ -82,20 +78,19 @@ def measure(quick: bool, store: Path, executor: Executor | None = None) -> Found
         )
         found.tables |= part.tables
         found.lines += part.lines
-    return found
+    return found, f"{' to '.join(dict.fromkeys((days[0], days[-1])))}, {'; '.join(machines)}"
 
 
-def summary(found: Found, quick: bool) -> str:
-    """The table of all modes, and where it was measured."""
+def summary(found: Found, where: str, quick: bool) -> str:
+    """The table of all modes, and when and on what it was measured."""
     header = ["what", "theory", "measured", "what the program does"]
     text = table("Ways to fail", header, [list(line) for line in found.lines])
     head, rest = text.split("\n", 1)
     widths = "   :widths: 20, 22, 33, 25"
     short = ", few points (``--quick``)" if quick else ""
     return (
-        f"Measured on {datetime.date.today()}, one thread of {os.cpu_count()} cores of "
-        f"{processor()}, Python {platform.python_version()}{short}. Courant numbers are "
-        "c_p dt / dx of the solid.\n\n" + "\n".join([head, widths, rest])
+        f"Measured on {where}, each row in one thread{short}. Courant numbers are c_p dt / dx of "
+        "the solid.\n\n" + "\n".join([head, widths, rest])
     )
 
 
@@ -109,13 +104,13 @@ def main(argv: list[str] | None = None) -> int:
     arguments.out.mkdir(parents=True, exist_ok=True)
     try:
         with connected(arguments.scheduler) as executor:
-            found = measure(arguments.quick, arguments.out / "stability.h5", executor)
+            found, where = measure(arguments.quick, arguments.out / "stability.h5", executor)
     except MpmoptError as error:
         print(f"{type(error).__name__}: {error}", file=sys.stderr)
         return 1
     for name, rows in found.tables.items():
         replace_file(arguments.out / f"stability_{name}.csv", as_csv(rows).encode())
-    text = summary(found, arguments.quick)
+    text = summary(found, where, arguments.quick)
     replace_file(arguments.out / "stability.rst", text.encode())
     figure.plot(arguments.out / "stability_map.png", found.tables)
     print(text)

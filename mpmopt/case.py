@@ -302,13 +302,15 @@ def summarise(result: Optimisation, drawing: Mapping[int, NDArray[np.bool_]]) ->
     there = drawing.get(result.settings.stages[best.stage].coarsening)
     actuations = [Variables.of(item.x, item.gamma.size) for item in (first, best)]
     actuation = actuations[1]
+    reference = _value_or_none(lambda: farthest(problem.scene, full_block, *actuations))
+    block = np.nan if reference is None else reference
 
     def numbers(values: np.ndarray) -> float | list[float]:
         return float(values[0]) if values.size == 1 else values.tolist()
 
     return {
         "start": _value_or_none(lambda: first.objective),
-        "reference": _value_or_none(lambda: farthest(problem.scene, full_block, *actuations)),
+        "reference": reference,
         "reference_drawn": None
         if there is None
         else _value_or_none(lambda: farthest(problem.scene, lambda _: there, *actuations)),
@@ -319,6 +321,11 @@ def summarise(result: Optimisation, drawing: Mapping[int, NDArray[np.bool_]]) ->
             (pieces(problem.scene, problem.gamma(best.x) >= THRESHOLD) > 0).sum()
         ),
         "post_processed_half_step": _number_or_none(audits[1].distance),
+        # Over the full block where it goes farther: as designed, or as in the row.
+        "gain": {
+            row.name: _number_or_none(row.distance - np.fmax(row.reference, block))
+            for row in audits
+        },
         "gain_kept": {row.name: _number_or_none(row.kept) for row in others},
         "greyness": best.greyness,
         "a": numbers(actuation.a),
@@ -423,7 +430,7 @@ def main(description: str, cases: Mapping[str, Case], argv: list[str] | None = N
 
     return reported(
         lambda: multistart(case, out, arguments.starts, arguments.scheduler, force),
-        "Every evaluation is saved; the same command goes on.",
+        "Every evaluation is saved; the same command without --force goes on.",
     )
 
 

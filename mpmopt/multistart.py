@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-import csv
 import dataclasses
 import functools
-import io
+import logging
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -17,12 +16,14 @@ from numpy.typing import NDArray
 
 from mpmopt import runfile
 from mpmopt.binary import Drawing
-from mpmopt.case import Case, run
-from mpmopt.errors import SweepError
-from mpmopt.files import make_folder, replace_file
-from mpmopt.optimize import Settings, Stage
+from mpmopt.case import RESULTS, Case, run
+from mpmopt.errors import RunFileError, SweepError
+from mpmopt.files import locked, make_folder, replace_file
+from mpmopt.optimize import Settings
 from mpmopt.scene import Design, Scene
-from mpmopt.sweeps import connected, sweep
+from mpmopt.sweeps import as_csv, connected, refuse_stuck, sweep
+
+logger = logging.getLogger(__name__)
 
 AMPLITUDE = 0.3  # standard deviation of a start's phi
 LENGTH = 0.15  # its correlation length, in longest sides of the design domain
@@ -41,15 +42,12 @@ def random_start(scene: Scene, seed: int) -> Callable[[NDArray], NDArray[np.floa
     ----------
     scene : Scene
     seed : int
-        0 is the plain start, phi = 0 everywhere.
 
     Returns
     -------
     callable
         From positions (D, 2) to phi (D,).
     """
-    if seed == 0:
-        return lambda position: np.zeros(len(position))
     corners = np.array([(r.lower, r.upper) for r in scene.body if isinstance(r, Design)])
     sides = np.ptp(corners, axis=(0, 1)) if len(corners) else np.ones(2)
     rng = np.random.default_rng(seed)
@@ -64,7 +62,13 @@ def random_start(scene: Scene, seed: int) -> Callable[[NDArray], NDArray[np.floa
 
 
 def one_start(
-    scene: str, settings: dict[str, Any], seed: int, *, drawing: Drawing, out: Path, force: bool
+    scene: str,
+    settings: dict[str, Any],
+    start: dict[str, Any],
+    seed: int,
+    *,
+    drawing: Drawing,
+    out: Path,
 ) -> dict[str, float]:
     """Optimise from one start, in a folder of its own, or go on with what was begun there.
 
@@ -74,31 +78,28 @@ def one_start(
     -------
     dict
         Numbers of the summary; `gain` is the post-processed design's over the full block, and
-        `audited_gain` what is left of it with half the step or cells half as wide, whichever is
-        less.
+        `audited_gain` the least of it as designed, with half the step, and with cells half as wide.
     """
-    stages = tuple(Stage(**stage) for stage in settings["stages"])
-    case = Case(Scene.from_json(scene), Settings(**{**settings, "stages": stages}), drawing)
+    case = Case(Scene.from_json(scene), Settings.from_dict(settings), drawing, start)
     folder = out / f"start-{seed}"
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / "log.txt").open("a", buffering=1) as log, contextlib.redirect_stderr(log):
-        summary = run(case, folder, force=force, phi=random_start(case.scene, seed))
+        summary = run(case, folder, phi=random_start(case.scene, seed) if seed else None)
 
     def number(value: float | None) -> float:
         return math.nan if value is None else float(value)
 
-    gain = number(summary["post_processed"]) - number(summary["reference"])
-    half, fine = (
-        number(summary["gain_kept"][name]) for name in ("half the step", "cells half as wide")
-    )
+    gains = {name: number(value) for name, value in summary["gain"].items()}
+    kept = summary["gain_kept"]
+    honest = ("as designed", "half the step", "cells half as wide")
     return {
         "reference": number(summary["reference"]),
         "optimised": summary["optimised"],
         "post_processed": number(summary["post_processed"]),
-        "gain": gain,
-        "kept_half_step": half,
-        "kept_half_cells": fine,
-        "audited_gain": gain * float(np.minimum(1.0, np.minimum(half, fine))),
+        "gain": gains["as designed"],
+        "kept_half_step": number(kept["half the step"]),
+        "kept_half_cells": number(kept["cells half as wide"]),
+        "audited_gain": float(np.min([gains[name] for name in honest])),
         "loose_particles": summary["loose_particles"],
         "evaluations": summary["evaluations"],
         "failed_evaluations": summary["failed_evaluations"],
@@ -109,11 +110,12 @@ def one_start(
 def multistart(
     case: Case, out: Path, starts: int, scheduler: str | None = None, force: bool = False
 ) -> str:
-    """Optimise a case from several starts, with seeds 0, 1, ... (`random_start`).
+    """Optimise a case from several starts: its own, and random ones with seeds 1, 2, ...
 
-    Starts run side by side. Leaves ``start-0``, ``start-1``, ..., one folder for each; the numbers
-    in ``starts.h5`` (`sweeps`) and ``starts.csv``; and ``starts.png``. A start whose numbers are
-    there is not run again; one that was stopped is gone on with.
+    The random ones replace the case's phi (`random_start`). Starts run side by side. Leaves
+    ``start-0``, ``start-1``, ..., one folder for each; the numbers in ``starts.h5`` (`sweeps`) and
+    ``starts.csv``; and ``starts.png``. A start whose numbers are there is not run again; one that
+    was stopped is gone on with.
 
     Parameters
     ----------
@@ -124,7 +126,7 @@ def multistart(
     scheduler : str, optional
         Address of a Dask cluster (`sweeps.connected`).
     force : bool, optional
-        Run all starts anew.
+        Remove what these starts left before, and run them anew.
 
     Returns
     -------
@@ -134,17 +136,23 @@ def multistart(
     Raises
     ------
     SweepError
-        If no start came to an end.
+        If no start came to an end, or the drawing cannot travel to other processes.
     StorageError
-        If the folder cannot be written to.
+        If the folder cannot be written to, or another process is at work in it.
     """
     out = Path(out).absolute()
     make_folder(out)
-    plan = {"scene": case.scene.to_json(), "settings": dataclasses.asdict(case.settings)}
-    function = functools.partial(one_start, drawing=case.drawing, out=out, force=force)
-    if force:
-        (out / "starts.h5").unlink(missing_ok=True)
+    plan = {
+        "scene": case.scene.to_json(),
+        "settings": dataclasses.asdict(case.settings),
+        "start": {name: np.asarray(value).tolist() for name, value in case.start.items()},
+    }
+    function = functools.partial(one_start, drawing=case.drawing, out=out)
     with connected(scheduler) as executor:
+        if executor is None:
+            refuse_stuck(function)
+        if force:
+            _clear(out, [out / f"start-{seed}" for seed in range(starts)])
         outcomes = sweep(
             function,
             [{**plan, "seed": seed} for seed in range(starts)],
@@ -163,28 +171,33 @@ def multistart(
     )
     if not rows:
         raise SweepError(f"no start came to an end\n{failed}")
-    replace_file(out / "starts.csv", as_csv(rows).encode())
+    plain = [{name.replace("_", " "): value for name, value in row.items()} for row in rows]
+    replace_file(out / "starts.csv", as_csv(plain, digits=4).encode())
     draw(out / "starts.png", out, rows)
     return failed + report(rows)
 
 
-def as_csv(rows: Sequence[dict[str, Any]]) -> str:
-    """Rows as comma-separated values, numbers with four digits."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(name.replace("_", " ") for name in rows[0])
-    for row in rows:
-        writer.writerow(f"{v:.4g}" if isinstance(v, float) else v for v in row.values())
-    return text.getvalue()
+def _clear(out: Path, folders: Sequence[Path]) -> None:
+    """Remove what starts left, once nobody is at work on any of it."""
+    with contextlib.ExitStack() as locks:
+        locks.enter_context(locked(out / "starts.h5"))
+        found = [folder for folder in folders if folder.is_dir()]
+        for folder in found:
+            locks.enter_context(locked(folder / "run.h5"))
+        (out / "starts.h5").unlink(missing_ok=True)
+        for folder in found:
+            for name in ("log.txt", *RESULTS, "run.h5"):  # that which says whose it is at last
+                (folder / name).unlink(missing_ok=True)
 
 
 def best_of(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """The row with the greatest audited gain; one that has none comes last."""
-    return max(rows, key=lambda row: (_finite(row["audited_gain"]), _finite(row["gain"])))
+    return max(rows, key=_rank)
 
 
-def _finite(value: float) -> float:
-    return value if math.isfinite(value) else -math.inf
+def _rank(row: dict[str, Any]) -> tuple[float, float]:
+    audited, gain = (np.nan_to_num(row[name], nan=-np.inf) for name in ("audited_gain", "gain"))
+    return audited, gain
 
 
 def report(rows: Sequence[dict[str, Any]]) -> str:
@@ -221,9 +234,7 @@ def draw(path: Path, out: Path, rows: Sequence[dict[str, Any]]) -> None:
     """Write a PNG: gains by start, and the designs, the best first, as far as there is room."""
     from mpmopt.draw import draw_design, new_figure, png
 
-    ranked = sorted(
-        rows, key=lambda row: (_finite(row["audited_gain"]), _finite(row["gain"])), reverse=True
-    )
+    ranked = sorted(rows, key=_rank, reverse=True)
     shown = ranked[:8]
     lines = -(-len(shown) // 4)
     figure = new_figure(10.0, 3.2 + 1.5 * lines)
@@ -251,8 +262,11 @@ def draw(path: Path, out: Path, rows: Sequence[dict[str, Any]]) -> None:
     axes.legend(fontsize=8, ncols=4, loc="lower center", bbox_to_anchor=(0.5, 1.0), frameon=False)
     axes.grid(True, axis="y", alpha=0.3)
     for axis, row in zip(lower.subplots(lines, 4, squeeze=False).flat, shown):
-        kept = runfile.read(out / f"start-{row['start']}" / "run.h5")
-        draw_design(axis, kept.problem(), kept.best)
+        try:
+            kept = runfile.read(out / f"start-{row['start']}" / "run.h5")
+            draw_design(axis, kept.problem(), kept.best)
+        except RunFileError as error:
+            logger.warning("no picture of start %d's design: %s", row["start"], error)
         axis.set_title(f"start {row['start']}: {row['audited_gain']:.3f}", fontsize=9)
     for axis in lower.axes:
         axis.set_axis_off()

@@ -5,8 +5,9 @@ from __future__ import annotations
 import dataclasses
 import logging
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -182,6 +183,11 @@ class Settings:
             )
         if self.tolerance < 0.0:
             raise DesignError(f"Settings: tolerance = {self.tolerance} must not be negative")
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Settings:
+        """The settings of which `dataclasses.asdict` makes these values."""
+        return cls(**{**values, "stages": tuple(Stage(**stage) for stage in values["stages"])})
 
 
 Callback = Callable[[Optimisation], None]

@@ -12,13 +12,12 @@ Layout (version 3)::
     stage/           a stage that is under way: what its next step depends on
     drawing/C        which particles of a drawn design are there, with C cells of the scene in one
 
-A digest (SHA-256) of all bytes stands behind the end of the HDF5 file.
+The file is sealed with a digest of all its bytes (`seals`).
 """
 
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import json
 import platform
 from collections.abc import Mapping
@@ -32,16 +31,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 import mpmopt
-from mpmopt.errors import MpmoptError, RunFileError
+from mpmopt.errors import RunFileError
 from mpmopt.files import replace_file
 from mpmopt.history import Candidate, Iteration, Leg, Optimisation, StageState
-from mpmopt.optimize import Settings, Stage
+from mpmopt.optimize import Settings
 from mpmopt.problem import Problem, Variables
 from mpmopt.scene import Scene
+from mpmopt.seals import refusing, sealed, unsealed
 
 FORMAT, VERSION = "mpmopt run", 3
-LARGEST = 10**9  # bytes of a run file
-SEAL = 80  # bytes of the digest at the end
 WHOLE = tuple(f.name for f in dataclasses.fields(Iteration) if f.type == "int")
 COLUMNS = tuple(f.name for f in dataclasses.fields(Iteration) if f.type in ("int", "float"))
 
@@ -218,33 +216,6 @@ def _write_stage(group: h5py.Group, state: StageState) -> None:
         group.create_dataset(f"mma/{name}", data=value, dtype="f8")
 
 
-def sealed(image: bytes) -> bytes:
-    """The bytes of an HDF5 file and, where HDF5 does not look, their digest."""
-    return image + b"\nmpmopt sha256 %s\n" % hashlib.sha256(image).hexdigest().encode()
-
-
-def _check_seal(path: Path) -> None:
-    """HDF5 may read a damaged file for ever, so it sees none."""
-    if path.stat().st_size > LARGEST:
-        raise RunFileError(
-            f"{path} has {path.stat().st_size} bytes, more than {LARGEST:.0e}: no run file is so "
-            "large"
-        )
-    content = path.read_bytes()
-    image = content[:-SEAL]
-    found, wanted = sealed(image)[-SEAL:], content[-SEAL:]
-    if not wanted.startswith(b"\nmpmopt sha256 "):
-        raise RunFileError(
-            f"{path} has no digest at its end: it is no run file of version {VERSION} of mpmopt, "
-            "or was cut or changed"
-        )
-    if found != wanted:
-        raise RunFileError(
-            f"{path} is damaged: its content has the digest {found[15:27].decode()}..., its own is "
-            f"{wanted[15:27].decode(errors='replace')}...; take a copy of it"
-        )
-
-
 def versions() -> dict[str, str]:
     """Of this package and of those it computes with."""
     import numba
@@ -271,24 +242,11 @@ def read(path: Path) -> RunFile:
     path = Path(path)
     if not path.is_file():
         raise RunFileError(f"{path} is not there; give the path of a run.h5")
-    try:
-        _check_seal(path)
-        # Run files are replaced as a whole, so none needs a lock; some file systems have none.
-        with h5py.File(path, "r", locking=False) as file:
-            return _read(file, path)
-    except MpmoptError as error:
-        if isinstance(error, RunFileError):
-            raise
-        raise RunFileError(f"{path} is damaged: {error}") from error
-    except (
-        OSError, LookupError, ValueError, TypeError, RuntimeError, AttributeError, ArithmeticError,
-        MemoryError,
-    ) as error:  # fmt: skip
-        raise RunFileError(f"{path} is no run file, or damaged: {error}") from error
+    with refusing(path, "run file", RunFileError), unsealed(path, "run file") as file:
+        return _read(file, path)
 
 
 def _read(file: h5py.File, path: Path) -> RunFile:
-    _refuse_foreign(file, {h5py.h5o.get_info(file.id).addr}, path.stat().st_size)
     if file.attrs.get("format") != FORMAT:
         raise RunFileError(f"{path} is HDF5 but no run file of mpmopt")
     if file.attrs["version"] != VERSION:
@@ -296,13 +254,12 @@ def _read(file: h5py.File, path: Path) -> RunFile:
             f"{path} is a run file of version {file.attrs['version']}, this mpmopt reads version "
             f"{VERSION}; its versions: {file.attrs.get('versions')}"
         )
-    settings = json.loads(file.attrs["settings"])
-    settings["stages"] = tuple(Stage(**stage) for stage in settings["stages"])
-    stages = len(settings["stages"])
+    settings = Settings.from_dict(json.loads(file.attrs["settings"]))
+    stages = len(settings.stages)
     legs = [_read_leg(file[f"legs/{number}"], stages) for number in range(len(file["legs"]))]
     run = Optimisation(
         scene=Scene.from_json(file.attrs["scene"]),
-        settings=Settings(**settings),
+        settings=settings,
         legs=legs,
         leg=int(file.attrs["leg"]),
         history=_read_history(file["history"]),
@@ -319,48 +276,6 @@ def _read(file: h5py.File, path: Path) -> RunFile:
         summary=dict(json.loads(file.attrs["summary"])),
         drawing={int(name): item[:] for name, item in file.get("drawing", {}).items()},
     )
-
-
-def _refuse_foreign(group: h5py.Group, seen: set[int], size: int) -> None:
-    """Refuse what no run file holds, before any of it is read: the file may be anybody's.
-
-    All must be in the file itself, under one name, whole, as long as it says, and numbers or text.
-    """
-    _refuse_attributes(group)
-    for name in group:
-        where = f"{group.name.rstrip('/')}/{name}"
-        link = group.get(name, getlink=True)
-        if not isinstance(link, h5py.HardLink):
-            raise ValueError(f"{where} leads elsewhere: {type(link).__name__}")
-        item = group[name]
-        address = h5py.h5o.get_info(item.id).addr
-        if address in seen:
-            raise ValueError(f"{where} has another name too")
-        seen.add(address)
-        if isinstance(item, h5py.Group):
-            _refuse_foreign(item, seen, size)
-            continue
-        if not isinstance(item, h5py.Dataset) or not _is_plain(item.dtype):
-            raise ValueError(f"{where} holds neither numbers nor text")
-        _refuse_attributes(item)
-        stored = item.id.get_create_plist()
-        if stored.get_layout() not in (h5py.h5d.CONTIGUOUS, h5py.h5d.COMPACT):
-            raise ValueError(f"{where} is not stored in one piece")
-        if stored.get_external_count():
-            raise ValueError(f"{where} is stored in another file")
-        if item.nbytes > size:
-            raise ValueError(f"{where} claims {item.nbytes} bytes of a file that has {size}")
-
-
-def _refuse_attributes(item: h5py.Group | h5py.Dataset) -> None:
-    for name in item.attrs:
-        kind = item.attrs.get_id(name)
-        if kind.shape != () or not _is_plain(kind.dtype):
-            raise ValueError(f"attribute {name} of {item.name} is neither one number nor a text")
-
-
-def _is_plain(dtype: np.dtype) -> bool:
-    return h5py.check_string_dtype(dtype) is not None or dtype.kind in "biuf"
 
 
 def _read_history(group: h5py.Group) -> list[Iteration]:

@@ -1,19 +1,22 @@
 """Many points, each computed once, in local processes or on a cluster, kept in one HDF5 file.
 
-Layout (version 1)::
+Layout (version 2)::
 
     attributes          format, version, function; versions of packages as JSON
     points/K/           point as JSON with sorted keys; error, empty if there is none
     points/K/result/    one number, text or array for each entry
 
-A point is known by its content: K is the SHA-256 of that JSON, shortened. The file is replaced by
-a complete one whenever results arrive: a killed program loses the points that were under way.
+A point is known by its content: K is the SHA-256 of that JSON, shortened. The file is sealed with
+a digest of all its bytes (`seals`), and replaced by a complete one whenever results arrive: a
+killed program loses the points that were under way.
 """
 
 from __future__ import annotations
 
+import csv
 import functools
 import hashlib
+import io
 import json
 import logging
 import multiprocessing
@@ -34,7 +37,9 @@ from concurrent.futures import (
 )
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
+from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
+from pickle import PicklingError
 from queue import SimpleQueue
 from typing import Any
 from uuid import uuid4
@@ -42,13 +47,15 @@ from uuid import uuid4
 import h5py
 import numpy as np
 
+from mpmopt.checks import count
 from mpmopt.errors import MissingLibraryError, SweepError
 from mpmopt.files import locked, replace_file
 from mpmopt.progress import Progress
+from mpmopt.seals import refusing, sealed, unsealed
 
 logger = logging.getLogger(__name__)
 
-FORMAT, VERSION = "mpmopt sweep", 1
+FORMAT, VERSION, KIND = "mpmopt sweep", 2, "sweep's file"
 
 DIED = "SweepError: its process died twice, the second time alone; it may lack memory\n"
 
@@ -112,7 +119,8 @@ def sweep(
     Raises
     ------
     SweepError
-        If a point is no JSON, the file is another one, or the executor gives up.
+        If a point is no JSON, the file is another one or damaged, no other process finds the
+        function, or the executor gives up.
     StorageError
         If the file cannot be written, or another program is at work in its folder; an older file
         is still whole.
@@ -122,13 +130,11 @@ def sweep(
     store = Path(store)
     keys = [_canonical(point) for point in points]
     run = functools.partial(_run, function)
-    inner = _inner(function)
-    if executor is None and _is_typed_in(inner):
-        raise SweepError(
-            f"{inner.__qualname__} was typed in, so no other process finds it; put it into a file, "
-            "or give an executor such as a ThreadPoolExecutor"
-        )
-    with locked(store), _open(store, inner.__qualname__) as file:
+    if workers is not None:
+        count("sweep", "workers", workers, 1, error=SweepError)
+    if executor is None:
+        refuse_stuck(function)
+    with locked(store), _open(store, _inner(function).__qualname__) as file:
         kept = file["points"]
         wanted = list(dict.fromkeys(keys))
         missing = [key for key in wanted if not _is_done(kept, key)]
@@ -186,6 +192,40 @@ def read(store: Path) -> list[Outcome]:
         raise SweepError(f"{store} is not there; give the path of a sweep's file")
     with _open(store, None) as file:
         return [_outcome(group) for group in file["points"].values()]
+
+
+def as_csv(rows: Sequence[Mapping[str, Any]], digits: int = 6) -> str:
+    """Rows of the same names as comma-separated values, numbers with so many digits."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(rows[0])
+    for row in rows:
+        cells = row.values()
+        writer.writerow(f"{v:.{digits}g}" if isinstance(v, float) else v for v in cells)
+    return text.getvalue()
+
+
+def refuse_stuck(function: Callable) -> None:
+    """Refuse a function that cannot travel to other processes, with all that is bound to it.
+
+    Raises
+    ------
+    SweepError
+    """
+    inner = _inner(function)
+    if _is_typed_in(inner):
+        raise SweepError(
+            f"{inner.__qualname__} was typed in, so no other process finds it; put it into a file, "
+            "or give an executor such as a ThreadPoolExecutor"
+        )
+    try:
+        ForkingPickler.dumps(function)
+    except (PicklingError, AttributeError, TypeError) as error:
+        raise SweepError(
+            f"{inner.__qualname__}, or what is bound to it, cannot travel to other processes: "
+            f"{error}; make each function one of a module or script, with `def` and not within "
+            "another"
+        ) from error
 
 
 @contextmanager
@@ -284,19 +324,18 @@ def _open(store: Path, function: str | None) -> h5py.File:
         file.attrs["function"], file.attrs["versions"] = function, json.dumps(versions())
         file.create_group("points", track_order=True)
         return file
-    try:
-        file = h5py.File(store, "r+", driver="core", backing_store=False)
-    except OSError as error:
-        raise SweepError(f"{store} is no sweep's file, or damaged: {error}") from error
-    found = file.attrs.get("format"), file.attrs.get("version"), file.attrs.get("function")
-    if found != (FORMAT, VERSION, function or found[2]) or "points" not in file:
-        file.close()
-        raise SweepError(
-            f"{store} holds {found[0]!r}, version {found[1]}, of function {found[2]!r}, not "
-            f"{FORMAT!r}, version {VERSION}, of {function!r}; choose another file"
-        )
-    before = json.loads(file.attrs["versions"])
-    changed = {name: now for name, now in versions().items() if before.get(name) != now}
+    with refusing(store, KIND, SweepError):
+        file = unsealed(store, KIND, writable=True)
+        found = tuple(file.attrs.get(name) for name in ("format", "version", "function"))
+        if found != (FORMAT, VERSION, function or found[2]):
+            raise SweepError(
+                f"{store} holds {found[0]!r}, version {found[1]}, of function {found[2]!r}, not "
+                f"{FORMAT!r}, version {VERSION}, of {function!r}; choose another file"
+            )
+        for group in file["points"].values():
+            _outcome(group)  # what cannot be read is found now
+        before = json.loads(file.attrs["versions"])
+        changed = {name: now for name, now in versions().items() if before.get(name) != now}
     if function and changed:
         logger.warning("%s was begun with %s; now it is %s", store, before, changed)
     return file
@@ -304,7 +343,7 @@ def _open(store: Path, function: str | None) -> h5py.File:
 
 def _save(file: h5py.File, store: Path) -> None:
     file.flush()
-    replace_file(store, file.id.get_file_image())
+    replace_file(store, sealed(file.id.get_file_image()))
 
 
 def _digest(key: str) -> str:
@@ -335,7 +374,7 @@ def _outcome(group: h5py.Group) -> Outcome:
         else:
             result[name] = dataset[()] if dataset.ndim else dataset[()].item()
     point = json.loads(group["point"].asstr()[()])
-    return Outcome(point, result, group["error"].asstr()[()])
+    return Outcome(dict(point), result, group["error"].asstr()[()])
 
 
 def _submitted(run: Callable[[str], Answer], keys: list[str], executor: Executor) -> Arrivals:

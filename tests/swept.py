@@ -3,6 +3,7 @@
 import os
 import signal
 import time
+from pathlib import Path
 
 
 def note(log, text):
@@ -21,9 +22,11 @@ def square(x, log=os.devnull):
     return {"square": x * x}
 
 
-def slow_square(x, log):
+def held_square(x, log, go):
+    """From the fourth point on, waits until there is a file."""
     note(log, os.getpid())
-    time.sleep(0.1)
+    while x >= 3 and not Path(go).exists():
+        time.sleep(0.02)
     return {"square": x * x}
 
 

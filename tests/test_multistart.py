@@ -1,31 +1,41 @@
 """Several starts: the field they begin with, what they leave, and which is the best."""
 
+import collections
+import contextlib
 import csv
 import dataclasses
 import json
 import math
+import shutil
+import signal
+from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 
+import climber
 import numpy as np
 import pytest
 from walker import slanted_legs, walker
 
-from mpmopt import runfile
-from mpmopt.case import Case, main
+from mpmopt import multistart, runfile
+from mpmopt.audit import audit
+from mpmopt.case import Case, main, run
+from mpmopt.errors import StorageError, SweepError
+from mpmopt.files import locked
+from mpmopt.interrupt import Interrupted
 from mpmopt.multistart import AMPLITUDE, LENGTH, best_of, random_start, report
 from mpmopt.optimize import Settings, Stage
 from mpmopt.problem import Problem
+from mpmopt.sweeps import sweep
 
 SCENE = walker(64, 8e-4)
 SIDE = 20 / 64  # the longest of the walker's design domain
 
 
-def test_the_first_start_is_the_plain_one_and_others_differ(rng):
+def test_random_starts_differ_and_can_be_had_again(rng):
     position = rng.uniform(0.0, SIDE, (50, 2))
-    assert not random_start(SCENE, 0)(position).any()
-    fields = [random_start(SCENE, seed)(position) for seed in range(4)]
+    fields = [random_start(SCENE, seed)(position) for seed in (1, 2, 3)]
     again = random_start(SCENE, 3)(position)
-    assert np.array_equal(fields[3], again)
+    assert np.array_equal(fields[2], again)
     assert all(np.abs(one - other).max() > 0.1 for one, other in pairwise(fields))
     assert max(np.abs(field).max() for field in fields) <= 1.0
 
@@ -82,7 +92,15 @@ TINY = Case(
 )  # fmt: skip
 
 
-def test_starts_leave_their_runs_and_are_run_once(tmp_path, capsys):
+@pytest.fixture
+def here(monkeypatch):
+    """Starts run in a thread of this process."""
+    with ThreadPoolExecutor(1) as executor:
+        monkeypatch.setattr(multistart, "connected", lambda _: contextlib.nullcontext(executor))
+        yield
+
+
+def test_starts_leave_their_runs_and_are_run_once(tmp_path, capsys, caplog):
     def command(starts):
         assert main("A case.", {"default": TINY}, ["--out", str(tmp_path), *starts]) == 0
         return capsys.readouterr().out
@@ -101,8 +119,89 @@ def test_starts_leave_their_runs_and_are_run_once(tmp_path, capsys):
         assert runfile.read(kept[number]).summary == summary
         gain = summary["post_processed"] - summary["reference"]
         assert float(line["gain"]) == pytest.approx(gain, rel=1e-3)
+    last = runfile.read(kept[1])
+    gains = {
+        row.name: row.distance - max(row.reference, summary["reference"])
+        for row in audit(last.problem(), last.best)
+    }
+    del gains["twice the step"]
+    assert float(line["audited gain"]) == pytest.approx(min(gains.values()), rel=1e-3)
     assert len({line["optimised"] for line in rows}) == 2
+    (tmp_path / "starts.png").unlink()
+    shutil.rmtree(tmp_path / "start-0")
+    assert command(["--starts", "2"]) == second
     assert (tmp_path / "starts.png").read_bytes().startswith(b"\x89PNG")
+    assert "no picture of start 0's design" in caplog.text
+    assert "start 1" not in caplog.text
+
+
+def test_the_plain_start_is_that_of_the_case(tmp_path, here):
+    case = Case(
+        dataclasses.replace(climber.climber(64, 8e-4), steps=5), TINY.settings,
+        climber.slanted_legs, climber.START,
+    )  # fmt: skip
+    run(case, tmp_path / "alone")
+    multistart.multistart(case, tmp_path, 1)
+    alone, start = (
+        runfile.read(tmp_path / name / "run.h5").run.first.x for name in ("alone", "start-0")
+    )
+    assert np.array_equal(start, alone)
+    assert {0.7, 0.2, -0.3} <= set(start)
+
+
+def test_a_loss_is_not_scaled(tmp_path, monkeypatch):
+    gain = {"as designed": -0.1, "half the step": -0.05, "twice the step": -9.0,
+            "cells half as wide": -0.2}  # fmt: skip
+    summary = collections.defaultdict(float, gain=gain, gain_kept=gain)
+    monkeypatch.setattr(multistart, "run", lambda *_, **__: summary)
+
+    def audited():
+        return multistart.one_start(
+            SCENE.to_json(), dataclasses.asdict(TINY.settings), dict(TINY.start), 0,
+            drawing=slanted_legs, out=tmp_path,
+        )["audited_gain"]  # fmt: skip
+
+    assert audited() == -0.2
+    gain["half the step"] = None
+    assert math.isnan(audited())
+
+
+def test_force_begins_anew_once_however_often_a_start_is_tried(tmp_path, here, monkeypatch):
+    multistart.multistart(TINY, tmp_path, 1)
+    log = tmp_path / "start-0" / "log.txt"
+    assert "finished run" not in log.read_text()
+
+    def tried_twice(function, points, *others):
+        function(**points[0])  # in a process that dies before it can answer
+        return sweep(function, points, *others)
+
+    monkeypatch.setattr(multistart, "sweep", tried_twice)
+    multistart.multistart(TINY, tmp_path, 1, force=True)
+    assert log.read_text().count("holds a finished run") == 1
+
+
+def test_force_removes_nothing_that_it_cannot_replace(tmp_path):
+    files = [tmp_path / "starts.h5", tmp_path / "start-1" / "run.h5"]
+    files[1].parent.mkdir()
+    for file in files:
+        file.write_text("somebody's work")
+    for file in files:
+        with locked(file), pytest.raises(StorageError, match="another process is at work"):
+            multistart.multistart(TINY, tmp_path, 2, force=True)
+    drawn = dataclasses.replace(TINY, drawing=lambda position: position[:, 0] > 0.0)
+    with pytest.raises(SweepError, match="cannot travel"):
+        multistart.multistart(drawn, tmp_path, 2, force=True)
+    assert [file.read_text() for file in files] == 2 * ["somebody's work"]
+
+
+def test_who_interrupts_is_told_to_go_on_without_force(tmp_path, capsys, monkeypatch):
+    def stopped(*_):
+        raise Interrupted(signal.SIGINT)
+
+    monkeypatch.setattr(multistart, "multistart", stopped)
+    arguments = ["--out", str(tmp_path), "--starts", "2", "--force"]
+    assert main("A case.", {"default": TINY}, arguments) == 130
+    assert "the same command without --force goes on" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("wrong", [["--starts", "0"], ["--scheduler", "tcp://here:1"]])

@@ -21,6 +21,7 @@ from mpmopt.files import locked, replace_file
 from mpmopt.interrupt import Interrupted, interruptible
 from mpmopt.optimize import Settings, Stage, go_on, optimise
 from mpmopt.problem import Problem
+from mpmopt.seals import sealed
 
 STAGES = (
     Stage(0.5, 1e-2, 1e-3, 4e-3),
@@ -202,7 +203,7 @@ def test_other_versions_are_warned_of(tmp_path, caplog, monkeypatch):
     with h5py.File(path, "r+") as file:
         file.attrs["summary"] = "{}"
         file.attrs["versions"] = '{"numba": "0.1"}'
-    path.write_bytes(runfile.sealed(path.read_bytes()))
+    path.write_bytes(sealed(path.read_bytes()))
     assert main("A case.", {"default": tiny}, arguments) == 0
     assert "digits may differ" in caplog.text
     assert np.isfinite(runfile.read(tmp_path / "run.h5").summary["optimised"])

@@ -17,6 +17,7 @@ from mpmopt.binary import post_processed
 from mpmopt.errors import RunFileError, StorageError
 from mpmopt.optimize import Settings, Stage, optimise
 from mpmopt.problem import Problem
+from mpmopt.seals import sealed
 
 STAGES = (Stage(0.5, 1e-2, 1e-3, 4e-3), Stage(2.0, 5e-3, 1e-3, 4e-3, solid=True))
 
@@ -91,7 +92,7 @@ def damaged(path, change, seal=True):
     with h5py.File(path, "r+") as file:
         change(file)
     if seal:
-        path.write_bytes(runfile.sealed(path.read_bytes()))
+        path.write_bytes(sealed(path.read_bytes()))
     return path
 
 

@@ -1,7 +1,9 @@
 """Where the method fails: the case's limits against theory, and named errors beyond them."""
 
 import csv
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from stability import (
     actuation,
     adversary,
     contact,
+    energy,
     fracture,
     gradients,
     inversion,
@@ -18,10 +21,12 @@ from stability import (
     time_step,
     weak,
 )
+from stability.common import Found
 
 from mpmopt.errors import SceneError, SimulationError
 from mpmopt.particles import lay_out
 from mpmopt.scene import Material
+from mpmopt.sweeps import as_csv
 
 # Time step.
 
@@ -276,12 +281,52 @@ def test_saturated_variables_have_no_slope_left():
 
 def test_a_module_becomes_tables_and_a_summary():
     found = optimiser.measure({})
-    text = stability_map.as_csv(found.tables["saturation"])
+    text = as_csv(found.tables["saturation"])
     rows = list(csv.DictReader(text.splitlines()))
     assert [float(row["beta"]) for row in rows] == list(optimiser.BETAS)
-    summary = stability_map.summary(found, quick=True)
+    summary = stability_map.summary(found, "a day", quick=True)
+    assert "Measured on a day, " in summary
     assert "few points" in summary
     assert summary.count("Moving asymptotes") == 3
+
+
+def test_energy_rows_are_known_by_what_they_are_not_by_their_place(monkeypatch):
+    points = energy.points(quick=True)[energy.balance]
+    assert all(point in energy.points(quick=False)[energy.balance] for point in points)
+    point = {"kind": "unstable", "case": "free block at Courant 1.3"}
+    assert points.count(point) == 1
+    row = energy.balance(**point)
+    cases = energy.cases
+    monkeypatch.setattr(energy, "cases", lambda quick: [("new", "first", None), *cases(quick)])
+    assert energy.points(quick=True)[energy.balance] == [{"kind": "new", "case": "first"}, *points]
+    assert energy.balance(**point) == row
+    assert row["energy"] > 1.0
+
+
+def test_a_summary_tells_when_and_on_what_its_rows_were_measured(tmp_path, monkeypatch):
+    def row(x):
+        return {"x": x}
+
+    module = SimpleNamespace(
+        row=row,
+        points=lambda quick: {row: [{"x": x} for x in range(2 if quick else 3)]},
+        measure=lambda measured: Found({"rows": measured[row]}, []),
+    )
+    monkeypatch.setattr(stability_map, "MODULES", {"module": module})
+    with ThreadPoolExecutor(1) as executor:
+
+        def where(name, quick):
+            monkeypatch.setattr(stability_map, "processor", lambda: name)
+            found, text = stability_map.measure(quick, tmp_path / "stability.h5", executor)
+            assert found.tables["rows"] == [{"x": x} for x in range(len(found.tables["rows"]))]
+            return text
+
+        first = where("the first machine", quick=True)
+        assert "the first machine" in first
+        assert where("another machine", quick=True) == first
+        both = where("another machine", quick=False)
+    assert "the first machine" in both
+    assert "another machine" in both
 
 
 @pytest.mark.slow

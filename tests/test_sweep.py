@@ -1,10 +1,10 @@
 """Sweeps: each point once, in local processes and on a real Dask cluster, whoever is killed."""
 
+import fcntl
 import functools
 import os
 import subprocess
 import sys
-import threading
 import time
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from multiprocessing import get_context
@@ -14,11 +14,12 @@ import h5py
 import numpy as np
 import pytest
 from conftest import small_scene
-from swept import deadly, gradient, note, noted, picky, slow_square, square, surroundings, whatever
+from swept import deadly, gradient, held_square, note, noted, picky, square, surroundings, whatever
 
 import mpmopt
 from mpmopt.errors import StorageError, SweepError
 from mpmopt.problem import Problem
+from mpmopt.seals import sealed
 from mpmopt.sweeps import Outcome, connected, read, results, sweep
 
 ROOT = Path(__file__).parent.parent
@@ -68,7 +69,7 @@ def cluster(tmp_path_factory):
 
 def test_results_come_back_as_they_were(store, threads):
     kinds = {"float": 0.1, "int": 3, "flag": True, "text": "h\u00e9", "nan": np.nan, "inf": -np.inf}
-    arrays = {"array": np.arange(6.0).reshape(2, 3), "empty": np.empty(0), "list": [1, 2]}
+    arrays = {"array": np.arange(6.0).reshape(2, 3), "empty": np.empty(0), "list": [1j, 2]}
     (outcome,) = sweep(lambda x: {**kinds, **arrays}, [{"x": 1}], store, threads)
     assert list(outcome.result) == [*kinds, *arrays]
     for name, value in kinds.items():
@@ -140,6 +141,7 @@ def test_another_file_is_refused_and_left_alone(tmp_path, threads):
     other = tmp_path / "other.h5"
     with h5py.File(other, "w") as file:
         file.attrs["format"] = "mpmopt run"
+    other.write_bytes(sealed(other.read_bytes()))
     damaged = tmp_path / "damaged.h5"
     damaged.write_bytes(b"\x89HDF\r\n")
     sweep(square, points(1), tmp_path / "sweep.h5", threads)
@@ -238,6 +240,16 @@ def test_a_function_that_no_other_process_finds_is_refused_at_once(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def test_what_cannot_travel_to_other_processes_is_refused_before_anything_runs(store):
+    for stuck in (lambda x: {}, functools.partial(square, log=lambda: 0)):
+        with pytest.raises(SweepError, match=r"cannot travel to other processes.*with `def`"):
+            sweep(stuck, points(1), store)
+    for workers in (-1, 0, 1.5):
+        with pytest.raises(SweepError, match=f"workers = {workers} must be"):
+            sweep(square, points(1), store, workers=workers)
+    assert not store.exists()
+
+
 # A Dask cluster.
 
 
@@ -270,10 +282,10 @@ CLIENT = """
 import functools, sys
 from pathlib import Path
 from mpmopt.sweeps import connected, sweep
-from swept import slow_square
-store, log, scheduler = sys.argv[1:]
+from swept import held_square
+store, log, go, scheduler = sys.argv[1:]
 with connected(scheduler or None) as executor:
-    function = functools.partial(slow_square, log=log)
+    function = functools.partial(held_square, log=log, go=go)
     sweep(function, [{"x": x} for x in range(25)], Path(store), executor)
 """
 
@@ -292,11 +304,11 @@ def until(condition, seconds=60.0):
         time.sleep(0.02)
 
 
-def kill_a_client(store, log, scheduler=""):
+def kill_a_client(store, log, go, scheduler):
     """Start a sweep in a process of its own and kill it once three results are kept."""
     path = os.pathsep.join([str(ROOT), str(ROOT / "tests")])
     client = subprocess.Popen(
-        [sys.executable, "-c", CLIENT, str(store), str(log), scheduler],
+        [sys.executable, "-c", CLIENT, str(store), str(log), str(go), scheduler],
         env={**os.environ, "PYTHONPATH": path}, stderr=subprocess.DEVNULL,
     )  # fmt: skip
     try:
@@ -304,6 +316,7 @@ def kill_a_client(store, log, scheduler=""):
     finally:
         client.kill()
         client.wait()
+        go.touch()  # a cluster is still at it
     return squares(read(store))
 
 
@@ -313,32 +326,85 @@ def test_after_the_client_is_killed_the_next_start_computes_what_is_missing(
 ):
     address = request.getfixturevalue("cluster") if where == "cluster" else ""
     first, second = tmp_path / "first", tmp_path / "second"
-    kept = kill_a_client(store, first, address)
-    assert 3 <= len(kept) < 25
+    go = tmp_path / "go"
+    assert kill_a_client(store, first, go, address) == {0: 0, 1: 1, 2: 4}
     if where == "processes" and Path("/proc").exists():
         until(lambda: not any(alive(process) for process in noted(first)))
     with connected(address or None) as executor:
-        function = functools.partial(slow_square, log=second)
+        function = functools.partial(held_square, log=second, go=go)
         outcomes = sweep(function, points(25), store, executor)
     assert squares(outcomes) == {x: x * x for x in range(25)}
-    assert len(noted(second)) == 25 - len(kept)
+    assert len(noted(second)) == 22
     assert len(read(store)) == 25
 
 
-def test_no_reader_ever_sees_half_a_file(store, threads):
-    seen, stop = [], threading.Event()
+def test_no_reader_ever_sees_half_a_file(store):
+    seen = []
 
-    def look():
-        while not stop.is_set():
-            if store.exists():
-                seen.append(len(read(store)))
+    def look(x):  # while the results of others are written
+        seen.append(len(read(store)))
+        return {}
 
-    reader = threading.Thread(target=look)
-    reader.start()
-    try:
-        sweep(square, points(60), store, threads)
-    finally:
-        stop.set()
-        reader.join()
+    with ThreadPoolExecutor(1) as executor:
+        results(sweep(look, points(30), store, executor))
+    assert len(seen) == 30
     assert seen == sorted(seen)
-    assert seen[-1] <= 60
+    assert seen[-1] <= 29
+
+
+def test_readers_and_sweeps_do_not_wait_for_each_other(store, threads):
+    sweep(square, points(2), store, threads)
+    with h5py.File(store) as held:  # with the lock of a reader
+        assert len(read(store)) == 2
+        assert squares(sweep(square, points(3), store, threads)) == {0: 0, 1: 1, 2: 4}
+        assert len(held["points"]) == 2
+    with store.open("rb") as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        assert len(read(store)) == 3
+
+
+# Files of others.
+
+
+def refused(store, threads, says):
+    """Both who read a file and who would go on with it are told, and it stays as it is."""
+    before = store.read_bytes()
+    with pytest.raises(SweepError, match=says):
+        read(store)
+    with pytest.raises(SweepError, match=says):
+        sweep(square, points(3), store, threads)
+    assert store.read_bytes() == before
+
+
+def test_hdf5_never_sees_a_sweep_of_which_a_byte_changed(store, threads, monkeypatch):
+    sweep(square, points(3), store, threads)
+    content = store.read_bytes()
+    monkeypatch.setattr(h5py.h5f, "open_file_image", lambda *_: pytest.fail("it was opened"))
+    for place in range(0, len(content), 997):
+        changed = bytearray(content)
+        changed[place] ^= 1 << (place % 8)
+        store.write_bytes(changed)
+        refused(store, threads, r"sweep\.h5.*digest")
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda f, k: f.pop("points"), "points"),
+        (lambda f, k: f.update({"points/other": 1.0}), "sweep.h5 is no sweep's file, or damaged"),
+        (lambda f, k: f[k].pop("result"), "result"),
+        (lambda f, k: f[k].pop("error"), "error"),
+        (lambda f, k: (f[k].pop("point"), f[k].update({"point": "no JSON"})), "damaged"),
+        (lambda f, k: (f[k].pop("point"), f[k].update({"point": "3"})), "damaged"),
+        (lambda f, k: (f[k].pop("error"), f[k].update({"error": 0.0})), "damaged"),
+        (lambda f, k: f.attrs.update(versions="[]"), "damaged"),
+        (lambda f, k: f[k].update({"result/x": h5py.SoftLink("/points")}), "leads elsewhere"),
+        (lambda f, k: f[k].create_dataset("result/x", (10**12,), "f8"), "claims 8000000000000"),
+    ],
+)
+def test_what_no_sweep_writes_is_refused_even_if_it_is_sealed(store, threads, change, says):
+    sweep(square, points(3), store, threads)
+    with h5py.File(store, "r+") as file:
+        change(file, f"points/{next(iter(file['points']))}")
+    store.write_bytes(sealed(store.read_bytes()))
+    refused(store, threads, says)

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
-from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -130,10 +129,10 @@ def cases(quick: bool) -> Iterator[tuple[str, str, Make]]:
             )
 
 
-def balance(number: int, quick: bool) -> dict[str, Any]:
-    """The share of energy that appears in one case, given by its place."""
-    kind, name, make = next(islice(cases(quick), number, None))
-    row: dict[str, Any] = {"kind": kind, "case": name, "courant": np.nan, "spin": np.nan,
+def balance(kind: str, case: str) -> dict[str, Any]:
+    """The share of energy that appears in one case."""
+    make = next(make for *names, make in cases(quick=False) if names == [kind, case])
+    row: dict[str, Any] = {"kind": kind, "case": case, "courant": np.nan, "spin": np.nan,
                            "energy": np.nan, "error": ""}  # fmt: skip
     try:
         margins = make().watch()[1]
@@ -144,8 +143,7 @@ def balance(number: int, quick: bool) -> dict[str, Any]:
 
 def points(quick: bool) -> Points:
     """All cases."""
-    count = sum(1 for _ in cases(quick))
-    return {balance: [{"number": number, "quick": quick} for number in range(count)]}
+    return {balance: [{"kind": kind, "case": case} for kind, case, _ in cases(quick)]}
 
 
 def measure(measured: Measured) -> Found:
