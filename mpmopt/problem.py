@@ -26,7 +26,7 @@ logger = logging.getLogger(__name__)
 
 # An evaluation that goes beyond these is not trusted (docs: theory, "Step control"); the stretch is
 # over the particles per cell and direction.
-LIMITS = Margins(courant=1.0, spin=0.5, jacobian=0.01, stretch=1.5, energy=0.05)
+LIMITS = Margins(courant=1.0, spin=0.5, jacobian=0.01, stretch=1.0, energy=0.05)
 
 
 class Variables(NamedTuple):
@@ -336,7 +336,7 @@ def refuse_nonsense(margins: Margins, simulation: Simulation) -> None:
     limit = LIMITS.stretch * per_cell
     if not margins.stretch <= limit:
         raise TornError(
-            f"solid is stretched {margins.stretch:.3g} times, beyond {limit:.3g} it is torn",
+            f"solid is stretched {margins.stretch:.3g} times, beyond {limit:.3g} it tears",
             simulation.steps,
             -1,
             (np.nan, np.nan),
