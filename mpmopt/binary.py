@@ -17,6 +17,9 @@ from mpmopt.scene import Scene
 from mpmopt.simulate import Simulation
 
 THRESHOLD = 0.3  # of gamma, as in the paper
+# Stretch over the particles per cell beyond which some cell has none: a body may crack there. An
+# optimiser may pass through (`problem.LIMITS`), but nothing that went so far counts.
+WHOLE = 1.0
 
 Drawing = Callable[[NDArray[np.float64]], NDArray[np.bool_]]
 
@@ -71,11 +74,11 @@ def distance(scene: Scene, keep: NDArray[np.bool_], variables: Variables) -> flo
     DesignError
         As `solid_body`.
     SimulationError
-        If the simulation fails, its solid is torn, or energy appears from nowhere.
+        If the simulation fails, its solid may be torn (`WHOLE`), or energy appears from nowhere.
     """
     simulation, objective = solid_body(scene, keep, variables)
     state, margins = simulation.watch()
-    refuse_nonsense(margins, simulation)
+    refuse_nonsense(margins, simulation, WHOLE)
     return float(objective.value(state))
 
 

@@ -26,7 +26,7 @@ logger = logging.getLogger(__name__)
 
 # An evaluation that goes beyond these is not trusted (docs: theory, "Step control"); the stretch is
 # over the particles per cell and direction.
-LIMITS = Margins(courant=1.0, spin=0.5, jacobian=0.01, stretch=1.0, energy=0.05)
+LIMITS = Margins(courant=1.0, spin=0.5, jacobian=0.01, stretch=1.5, energy=0.05)
 
 
 class Variables(NamedTuple):
@@ -318,8 +318,17 @@ class Problem:
         refuse_nonsense(margins, simulation)
 
 
-def refuse_nonsense(margins: Margins, simulation: Simulation) -> None:
+def refuse_nonsense(
+    margins: Margins, simulation: Simulation, stretch: float = LIMITS.stretch
+) -> None:
     """A run in which energy appeared from nowhere or solid was torn is an error.
+
+    Parameters
+    ----------
+    margins : Margins
+    simulation : Simulation
+    stretch : float, optional
+        Where solid is torn, over the particles per cell and direction.
 
     Raises
     ------
@@ -333,7 +342,7 @@ def refuse_nonsense(margins: Margins, simulation: Simulation) -> None:
             f"over, the limit is {LIMITS.energy:.3g}",
         )
     per_cell = simulation.scene.particles_per_cell
-    limit = LIMITS.stretch * per_cell
+    limit = stretch * per_cell
     if not margins.stretch <= limit:
         raise TornError(
             f"solid is stretched {margins.stretch:.3g} times, beyond {limit:.3g} it tears",

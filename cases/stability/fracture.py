@@ -177,8 +177,8 @@ def measure(measured: Measured) -> Found:
             f"weakest cut carries {cuts[2, 2.0]:.0%}, {cuts[2, 3.0]:.0%}, {abs(cuts[2, 4.0]):.0%} "
             f"at stretch 2, 3, 4 ({cuts[3, 3.0]:.0%} and {abs(cuts[3, 6.0]):.0%} at 3 and 6); a "
             f"pulled bar tears from {torn[2]:g} ({torn[3]:g}) c_p on",
-            "A simulation runs on, **and is wrong**; `Problem` ends in a TornError beyond one "
-            "particle a cell.",
+            "A simulation runs on, **and is wrong**; `Problem` ends in a TornError beyond 1.5 "
+            "times one particle a cell, and bodies without void beyond one.",
         )
     )
     found.lines.append(
