@@ -102,7 +102,7 @@ def test_a_body_that_may_be_cracked_is_climbed_through_but_does_not_count():
     problem, x = driven_walker(0.8)
     stretch = problem.evaluate(x).margins.stretch
     assert 1.0 < stretch / problem.scene.particles_per_cell <= LIMITS.stretch
-    with pytest.raises(TornError, match=r"solid is stretched 2\.3. times, beyond 2 it tears"):
+    with pytest.raises(TornError, match=r"solid is stretched 2\.\d+ times, beyond 2 it tears"):
         post_processed(problem, x)
     problem, x = driven_walker(0.6)
     assert np.isfinite(post_processed(problem, x))
