@@ -418,9 +418,11 @@ class _StageRun:
         return mma.step(x, -self.values[-1], -self.gradient)
 
     def _best_before(self) -> NDArray[np.float64] | None:
-        """The best design of the stage before, if it is of the same grid."""
+        """The best design of the stage before, on this stage's grid."""
         before = self.run.best.get(self.leg.stage - 1)
-        return before.x if before is not None and before.x.size == self.problem.size else None
+        if before is None or before.x.size == self.problem.size:
+            return before.x if before else None
+        return self.problem.transfer(Problem(self.whole.scenes[before.stage]), before.x)
 
     def _evaluate(self, x: NDArray[np.float64]) -> None:
         """Value and gradient, recorded, even of a simulation that failed."""
