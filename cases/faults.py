@@ -206,7 +206,10 @@ def signals(folder: Path, whole: dict[str, Any], dice: random.Random, count: int
                 found, text = process.end(number)
                 longest = max(longest, time.monotonic() - began)
                 told = f"{number.name}. Every evaluation is saved; go on with: python" in text
-                survived += found == code and told and resumed(out) == whole
+                same = resumed(out) == whole
+                survived += found == code and told and same
+                if not (found == code and told and same):
+                    show(f"not survived: exit code {found}, same: {same}, it said: {text}")
                 cold.cleanup()
             rows.append(
                 Row(f"{number.name} in {where}", times, survived, f"{longest:.2f} s to exit")
