@@ -21,7 +21,7 @@ import numpy as np
 import walker
 
 from mpmopt import runfile
-from mpmopt.binary import THRESHOLD, distance
+from mpmopt.binary import distance, kept
 from mpmopt.case import START
 from mpmopt.particles import Particles, lay_out
 from mpmopt.problem import Variables
@@ -55,7 +55,7 @@ def designed(path: Path, blend_time: float, halvings: int) -> float:
     run = runfile.read(path)
     problem, x = run.problem(), run.best
     scene = replace(problem.scene.vary(time_step=8e-4 / 2**halvings), blend_time=blend_time)
-    keep, signal = problem.gamma(x) >= THRESHOLD, problem.split(x)
+    keep, signal = kept(problem, x), problem.split(x)
     return distance(scene, keep, signal) - distance(replace(scene, steps=1), keep, signal)
 
 

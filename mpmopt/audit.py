@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mpmopt.binary import THRESHOLD, distance
+from mpmopt import binary
+from mpmopt.binary import distance
 from mpmopt.errors import SceneError, SimulationError
 from mpmopt.particles import lay_out, nearest_designed
 from mpmopt.problem import Problem
@@ -78,8 +79,7 @@ def least(problem: Problem, x: NDArray[np.float64]) -> float:
 
 def _laid_out(scene: Scene, problem: Problem, x: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Which design particles of another lattice are there: those whose nearest one is solid."""
-    solid = problem.gamma(x) >= THRESHOLD
-    return solid[nearest_designed(lay_out(scene), problem.particles)]
+    return binary.kept(problem, x)[nearest_designed(lay_out(scene), problem.particles)]
 
 
 def audit(

@@ -112,7 +112,7 @@ def unactuated(problem: Problem, x: NDArray) -> float:
     """Objective L of the post-processed design when no actuator works: how far it merely falls."""
     variables = problem.split(x)
     still = variables._replace(a=0.0 * variables.a, b=0.0 * variables.b)
-    return distance(problem.scene, problem.gamma(x) >= THRESHOLD, still)
+    return distance(problem.scene, kept(problem, x), still)
 
 
 def pieces(scene: Scene, keep: NDArray[np.bool_]) -> NDArray[np.int64]:

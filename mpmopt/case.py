@@ -14,17 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mpmopt import runfile
+from mpmopt import binary, runfile
 from mpmopt.audit import audit
-from mpmopt.binary import (
-    THRESHOLD,
-    Drawing,
-    farthest,
-    full_block,
-    pieces,
-    post_processed,
-    unactuated,
-)
+from mpmopt.binary import Drawing, farthest, full_block, pieces, post_processed, unactuated
 from mpmopt.checkpoints import Checkpointing
 from mpmopt.errors import DesignError, MpmoptError, RunFileError, SimulationError, StorageError
 from mpmopt.files import locked, make_folder, replace_file
@@ -317,9 +309,7 @@ def summarise(result: Optimisation, drawing: Mapping[int, NDArray[np.bool_]]) ->
         "optimised": best.objective,
         "post_processed": _value_or_none(lambda: post_processed(problem, best.x)),
         "actuation_off": _value_or_none(lambda: unactuated(problem, best.x)),
-        "loose_particles": int(
-            (pieces(problem.scene, problem.gamma(best.x) >= THRESHOLD) > 0).sum()
-        ),
+        "loose_particles": int((pieces(problem.scene, binary.kept(problem, best.x)) > 0).sum()),
         "post_processed_half_step": _number_or_none(audits[1].distance),
         # Over the full block where it goes farther: as designed, or as in the row.
         "gain": {
