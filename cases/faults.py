@@ -13,6 +13,7 @@ import argparse
 import contextlib
 import dataclasses
 import fcntl
+import itertools
 import json
 import os
 import random
@@ -34,6 +35,7 @@ from walker import slanted_legs, walker
 from mpmopt import case, runfile, simulate
 from mpmopt.checkpoints import Checkpointing
 from mpmopt.files import replace_file
+from mpmopt.interrupt import how_to_go_on, reported
 from mpmopt.optimize import Settings, Stage
 from mpmopt.sweeps import as_csv
 
@@ -102,8 +104,9 @@ def child(out: Path, phase: Path | None, on_disk: bool) -> int:
         simulate.together = telling(simulate.together, lambda *a: a[2].__name__)
         runfile.replace_file = telling(runfile.replace_file, lambda *a: "write")
     checkpointing = Checkpointing(every=7, store="disk") if on_disk else None
-    return case.reported(
-        lambda: case.table(case.run(SMALL, out, checkpointing)), case.how_to_go_on(out / "run.h5")
+    return reported(
+        lambda: print(case.table(case.run(SMALL, out, checkpointing))),
+        how_to_go_on(out / "run.h5"),
     )
 
 
@@ -194,14 +197,16 @@ def signals(folder: Path, whole: dict[str, Any], dice: random.Random, count: int
             survived, longest = 0, 0.0
             times = 1 if where == "compilation" else count
             for k in range(times):
-                out = folder / f"{number.name}-{where}-{k}"
                 cold = tempfile.TemporaryDirectory()
                 environment = {"NUMBA_CACHE_DIR": cold.name} if where == "compilation" else {}
-                process = Process(out, environment=environment)
-                process.wait_for("forward")
-                time.sleep(dice.uniform(0.0, 1.0))
-                if where != "compilation":
-                    process.wait_for(where, seconds=10.0)
+                for attempt in itertools.count():
+                    out = folder / f"{number.name}-{where}-{k}-{attempt}"
+                    process = Process(out, environment=environment)
+                    process.wait_for("forward")
+                    time.sleep(dice.uniform(0.0, 1.0))
+                    if where == "compilation" or process.wait_for(where):
+                        break
+                    process.end()  # a fast machine was through by then
                 began = time.monotonic()
                 found, text = process.end(number)
                 longest = max(longest, time.monotonic() - began)

@@ -23,14 +23,14 @@ from numpy.typing import NDArray
 
 from mpmopt import runfile
 from mpmopt.actuation import signal
-from mpmopt.audit import refined
-from mpmopt.binary import THRESHOLD, Drawing, distance, full_block, post_processed
+from mpmopt.audit import laid_out, refined
+from mpmopt.binary import Drawing, distance, full_block, post_processed
 from mpmopt.case import START
 from mpmopt.design import interpolate
 from mpmopt.errors import MpmoptError, SimulationError
 from mpmopt.objective import Objective
 from mpmopt.optimize import Optimisation, Settings, Stage, optimise
-from mpmopt.particles import lay_out, nearest_designed
+from mpmopt.particles import lay_out
 from mpmopt.problem import Problem, Variables
 from mpmopt.scene import Scene
 from mpmopt.simulate import Simulation
@@ -159,11 +159,11 @@ def rows_of(name: str, cells: int, iterations: int) -> Iterator[Row]:
         runs[label] = short_optimisation(scene, void, iterations)
         seconds[label] = time.process_time() - began
         print(f"{name}, {label}: {runs[label].failed_evaluations} failed", file=sys.stderr)
-    best = runs[label].result  # the last one's, whose void is left out: as binary as they come
     changes = [
         moved(there, keep, variables)
         for there in (scene, refined(scene))
-        for keep, variables in designs(there, scene, drawing, best.x, best.gamma)
+        # The last one's void is left out: it is as binary as they come.
+        for keep, variables in designs(there, drawing, runs[label])
     ]
     for index, (label, run) in enumerate(runs.items()):
         yield Row(
@@ -188,17 +188,13 @@ def solid_distance(run: Optimisation) -> str:
 
 
 def designs(
-    scene: Scene,
-    designed_in: Scene,
-    drawing: Drawing,
-    x: NDArray[np.float64],
-    gamma: NDArray[np.float64],
+    scene: Scene, drawing: Drawing, run: Optimisation
 ) -> list[tuple[NDArray[np.bool_], Variables]]:
     """The drawn binary design and the optimised one, with their actuation, on a scene's grid."""
     particles = lay_out(scene)
     drawn = drawing(particles.position[particles.designed])
-    solid = (gamma >= THRESHOLD)[nearest_designed(particles, lay_out(designed_in))]
-    return [(drawn, start_actuation()), (solid, Variables.of(x, gamma.size))]
+    problem, x = run.problem(), run.result.x
+    return [(drawn, start_actuation()), (laid_out(scene, problem, x), problem.split(x))]
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -23,21 +23,24 @@ from pathlib import Path
 from typing import Any
 
 from mpmopt import __version__
-from mpmopt.errors import DesignError, MpmoptError
-from mpmopt.interrupt import Interrupted, interruptible
+from mpmopt.errors import DesignError
+from mpmopt.interrupt import how_to_go_on, reported
+
+REPLACE = "replace files of that name that mpmopt did not make"
 
 
-def plot(path: Path, out: Path | None) -> int:
+def plot(path: Path, out: Path | None, force: bool) -> int:
     """Write pictures of a run: its scene, its bodies in motion, its history."""
     from mpmopt import runfile
-    from mpmopt.files import make_folder
-    from mpmopt.plot import PICTURES, plot_run
+    from mpmopt.files import make_folder, refuse_foreign
+    from mpmopt.plot import pictures, plot_run
     from mpmopt.progress import Progress
 
     run = runfile.read(path)
     folder = out or path.parent
+    refuse_foreign(pictures(folder), force)
     make_folder(folder)
-    with Progress("pictures", PICTURES) as progress:
+    with Progress("pictures", len(pictures(folder))) as progress:
 
         def written(picture: Path) -> None:
             progress.step(picture.name)
@@ -47,16 +50,17 @@ def plot(path: Path, out: Path | None) -> int:
     return 0
 
 
-def film(path: Path, out: Path | None, mp4: bool, seconds: float | None) -> int:
+def film(path: Path, out: Path | None, mp4: bool, seconds: float | None, force: bool) -> int:
     """Write a film of a run's design, the same without grey, and the full block."""
     from mpmopt import runfile
-    from mpmopt.files import make_folder
+    from mpmopt.files import make_folder, refuse_foreign
     from mpmopt.film import film as filmed
 
     if mp4 and out is not None and out.suffix.lower() != ".mp4":
         raise DesignError(f"--mp4 does not write {out}: leave --mp4 out, or let FILE end in .mp4")
     run = runfile.read(path)
     target = out or path.parent / ("film.mp4" if mp4 else "film.gif")
+    refuse_foreign([target], force)
     make_folder(target.parent)
     print(f"{target}: {filmed(target, run, seconds)}")
     return 0
@@ -173,20 +177,24 @@ def cheapest(path: Path, tolerance: float, gradient_tolerance: float | None, sec
 
 
 def resume(path: Path) -> int:
-    """Go on with a run that was stopped; the exit code says how that ended."""
+    """Go on with a run that was stopped, and print its summary."""
     from mpmopt import case
 
-    return case.reported(lambda: case.table(case.resume(path)), case.how_to_go_on(path))
+    print(case.table(case.resume(path)))
+    return 0
 
 
-def export(path: Path, out: Path | None, **options: Any) -> int:
+def export(path: Path, out: Path | None, force: bool, **options: Any) -> int:
     """Write a run's best design as files that other programs read, and print what was written."""
     from mpmopt import runfile
+    from mpmopt.export import FILES, size
     from mpmopt.export import export as exported
-    from mpmopt.export import size
+    from mpmopt.files import refuse_foreign
 
     run = runfile.read(path)
-    done = exported(run.problem(), run.best, out or path.parent, **options)
+    folder = out or path.parent
+    refuse_foreign((folder / FILES[name] for name in options["formats"]), force)
+    done = exported(run.problem(), run.best, folder, **options)
     for file in done.paths:
         print(f"{file}  {file.stat().st_size} bytes")
     if done.polygons:
@@ -205,21 +213,14 @@ def main(argv: list[str] | None = None) -> int:
     """Run a command; the exit code is one of those in the module's text."""
     arguments = _parser().parse_args(argv)
     logging.basicConfig(format="%(message)s")
-    try:
-        with interruptible("Files are complete or absent."):
-            return int(arguments.do(arguments))
-    except MpmoptError as error:
-        print(f"{type(error).__name__}: {error}", file=sys.stderr)
-        return 1
-    except Interrupted as interrupted:
-        print(f"\n{interrupted}.", file=sys.stderr)
-        return interrupted.code
+    return reported(lambda: arguments.do(arguments), arguments.advice(arguments.path))
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="mpmopt", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
+    parser.set_defaults(advice=lambda path: "Files are complete or absent.")
     parser.add_argument("--version", action="version", version=f"mpmopt {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND", title="commands")
 
@@ -240,7 +241,7 @@ def _parser() -> argparse.ArgumentParser:
         "Go on with an unfinished run to the end that it would have had without a stop.",
         "out/walker/run.h5",
     )
-    command.set_defaults(do=lambda arguments: resume(arguments.path))
+    command.set_defaults(do=lambda arguments: resume(arguments.path), advice=how_to_go_on)
 
     command = add(
         "plot",
@@ -251,7 +252,8 @@ def _parser() -> argparse.ArgumentParser:
         "out/walker/run.h5 --out pictures",
     )
     command.add_argument("--out", type=Path, metavar="DIR", help="folder (default: the run's)")
-    command.set_defaults(do=lambda arguments: plot(arguments.path, arguments.out))
+    command.add_argument("--force", action="store_true", help=REPLACE)
+    command.set_defaults(do=lambda arguments: plot(arguments.path, arguments.out, arguments.force))
 
     command = add(
         "film",
@@ -269,8 +271,11 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument(
         "--seconds", type=float, help="that it plays (default: so that each period is seen)"
     )
+    command.add_argument("--force", action="store_true", help=REPLACE)
     command.set_defaults(
-        do=lambda arguments: film(arguments.path, arguments.out, arguments.mp4, arguments.seconds)
+        do=lambda arguments: film(
+            arguments.path, arguments.out, arguments.mp4, arguments.seconds, arguments.force
+        )
     )
 
     command = add(
@@ -358,9 +363,10 @@ def _parser() -> argparse.ArgumentParser:
         "--drop-loose", action="store_true", help="leave out pieces that hang on nothing"
     )
     command.add_argument("--out", type=Path, metavar="DIR", help="folder (default: the run's)")
+    command.add_argument("--force", action="store_true", help="replace earlier exports")
     command.set_defaults(
         do=lambda arguments: export(
-            **{name: value for name, value in vars(arguments).items() if name != "do"}
+            **{k: v for k, v in vars(arguments).items() if k not in ("do", "advice")}
         )
     )
     return parser

@@ -72,13 +72,19 @@ def least(problem: Problem, x: NDArray[np.float64]) -> float:
     """
     scene = problem.scene
     return min(
-        distance(there, _laid_out(there, problem, x), problem.split(x))
+        distance(there, laid_out(there, problem, x), problem.split(x))
         for there in (scene.vary(time_step=scene.time_step / 2.0), refined(scene))
     )
 
 
-def _laid_out(scene: Scene, problem: Problem, x: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which design particles of another lattice are there: those whose nearest one is solid."""
+def laid_out(scene: Scene, problem: Problem, x: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """A post-processed design on another scene's lattice: particles whose nearest one is solid.
+
+    Returns
+    -------
+    (D,) array of bool
+        Which design particles of the scene are there.
+    """
     return binary.kept(problem, x)[nearest_designed(lay_out(scene), problem.particles)]
 
 
@@ -125,7 +131,7 @@ def audit(
         there = scene
         try:
             there = make()
-            keep = _laid_out(there, problem, x)
+            keep = laid_out(there, problem, x)
             reference = distance(there, np.ones_like(keep), variables)
             row = Audited(name, there.grid.cells, there.time_step, reference)
             row = replace(row, distance=distance(there, keep, variables))

@@ -18,10 +18,10 @@ from mpmopt import binary, runfile
 from mpmopt.audit import audit
 from mpmopt.binary import Drawing, farthest, full_block, pieces, post_processed, unactuated
 from mpmopt.checkpoints import Checkpointing
-from mpmopt.errors import DesignError, MpmoptError, RunFileError, SimulationError, StorageError
-from mpmopt.files import locked, make_folder, replace_file
+from mpmopt.errors import DesignError, RunFileError, SimulationError, StorageError
+from mpmopt.files import locked, make_folder, refuse_foreign, replace_file
 from mpmopt.history import Optimisation
-from mpmopt.interrupt import Interrupted, interruptible
+from mpmopt.interrupt import how_to_go_on, reported
 from mpmopt.optimize import Settings, Stage, begin, go_on
 from mpmopt.particles import lay_out
 from mpmopt.problem import Problem, Variables
@@ -211,12 +211,7 @@ def run(
                     "--force to replace it"
                 )
             return _go_on(path, kept, checkpointing)
-        foreign = [name for name in RESULTS if (out / name).exists()]
-        if foreign and not force:
-            raise StorageError(
-                f"{out} holds {', '.join(foreign)} but no run.h5; choose another folder, or "
-                "--force to replace them"
-            )
+        refuse_foreign((out / name for name in RESULTS), force)
         runfile.write(path, begin(case.scene, case.settings, starts), drawing=drawn(case))
         return _go_on(path, runfile.read(path), checkpointing)
 
@@ -413,31 +408,14 @@ def main(description: str, cases: Mapping[str, Case], argv: list[str] | None = N
     if arguments.starts is None:
         if arguments.scheduler:
             parser.error("--scheduler is for --starts: one run is one process")
-        return reported(lambda: table(run(case, out, force=force)), how_to_go_on(out / "run.h5"))
+        return reported(
+            lambda: print(table(run(case, out, force=force))), how_to_go_on(out / "run.h5")
+        )
     if arguments.starts < 1:
         parser.error(f"--starts {arguments.starts}: at least 1")
     from mpmopt.multistart import multistart
 
     return reported(
-        lambda: multistart(case, out, arguments.starts, arguments.scheduler, force),
+        lambda: print(multistart(case, out, arguments.starts, arguments.scheduler, force)),
         "Every evaluation is saved; the same command without --force goes on.",
     )
-
-
-def how_to_go_on(path: Path) -> str:
-    """Advice to someone whose run was interrupted."""
-    return f"Every evaluation is saved; go on with: python -m mpmopt resume {path}"
-
-
-def reported(work: Callable[[], str], advice: str) -> int:
-    """Print the text that some work ends with, or why it ended and an advice; the exit code."""
-    try:
-        with interruptible(advice):
-            print(work())
-    except MpmoptError as error:
-        print(f"{type(error).__name__}: {error}", file=sys.stderr)
-        return 1
-    except Interrupted as interrupted:
-        print(f"\n{interrupted}. {advice}", file=sys.stderr)
-        return interrupted.code
-    return 0

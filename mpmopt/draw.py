@@ -17,6 +17,7 @@ from matplotlib.path import Path as Outline
 from matplotlib.transforms import Affine2D
 from numpy.typing import NDArray
 
+from mpmopt.files import MARK
 from mpmopt.history import Optimisation
 from mpmopt.motion import Motion, optimised
 from mpmopt.problem import Problem
@@ -40,7 +41,7 @@ def new_figure(width: float, height: float) -> Figure:
 def png(figure: Figure, dpi: int = 120) -> bytes:
     """A figure as the content of a PNG file."""
     content = BytesIO()
-    figure.savefig(content, format="png", dpi=dpi)
+    figure.savefig(content, format="png", dpi=dpi, metadata={"Comment": MARK})
     return content.getvalue()
 
 

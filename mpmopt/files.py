@@ -6,7 +6,7 @@ import fcntl
 import logging
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from uuid import uuid4
@@ -14,6 +14,8 @@ from uuid import uuid4
 from mpmopt.errors import StorageError
 
 logger = logging.getLogger(__name__)
+
+MARK = "made by mpmopt"  # in the metadata of pictures and films
 
 
 def replace_file(path: Path, content: bytes) -> None:
@@ -39,6 +41,29 @@ def replace_file(path: Path, content: bytes) -> None:
     finally:
         with suppress(OSError):
             new.unlink(missing_ok=True)
+
+
+def refuse_foreign(paths: Iterable[Path], force: bool = False) -> None:
+    """Refuse to replace files that others made or may have edited: all that have no `MARK`.
+
+    Raises
+    ------
+    StorageError
+        If some are there, and it is not forced.
+    """
+    foreign = [str(path) for path in paths if path.exists() and not _is_marked(path)]
+    if foreign and not force:
+        raise StorageError(
+            f"{', '.join(foreign)} {'are' if foreign[1:] else 'is'} there already; choose another "
+            "place with --out, or --force to replace what is there"
+        )
+
+
+def _is_marked(path: Path) -> bool:
+    try:
+        return MARK.encode() in path.read_bytes()
+    except OSError:  # such as a folder
+        return False
 
 
 def make_folder(folder: Path) -> None:

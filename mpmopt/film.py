@@ -19,7 +19,7 @@ from PIL import Image
 
 from mpmopt.draw import BLUE, RED, Squares, draw_walls, new_figure, set_view, view
 from mpmopt.errors import DesignError, MissingLibraryError, SimulationError, StorageError
-from mpmopt.files import replace_file
+from mpmopt.files import MARK, replace_file
 from mpmopt.motion import Motion, equal_steps, optimised, post_processed, reference
 from mpmopt.progress import Progress
 from mpmopt.runfile import RunFile
@@ -248,7 +248,7 @@ def _gif(frames: Iterator[NDArray[np.uint8]]) -> bytes:
     content = BytesIO()
     images[0].save(
         content, format="GIF", save_all=True, append_images=images[1:], duration=durations, loop=0,
-        optimize=True,
+        optimize=True, comment=MARK,
     )  # fmt: skip
     return content.getvalue()
 
@@ -275,7 +275,8 @@ def _mp4(frames: Iterator[NDArray[np.uint8]]) -> bytes:
         command = [
             _ffmpeg(), "-v", "error", "-f", "rawvideo", "-pix_fmt", "rgb24",
             "-s", f"{width}x{height}", "-r", str(RATE), "-i", "-", "-an", "-c:v", "libx264",
-            "-pix_fmt", "yuv420p", "-crf", "20", "-movflags", "+faststart", str(path),
+            "-pix_fmt", "yuv420p", "-crf", "20", "-movflags", "+faststart",
+            "-metadata", f"comment={MARK}", str(path),
         ]  # fmt: skip
         with log.open("w") as messages:
             process = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=messages)

@@ -1,4 +1,4 @@
-"""SIGINT and SIGTERM end a run within a second and say how to go on."""
+"""How a command ends: SIGINT and SIGTERM end it within a second and say how to go on."""
 
 from __future__ import annotations
 
@@ -6,9 +6,12 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from types import FrameType
+
+from mpmopt.errors import MpmoptError
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 # Seconds in which the process may leave what it is at; some of a compiler's calls take longer.
@@ -76,3 +79,34 @@ def interruptible(advice: str) -> Iterator[None]:
         os.close(writer)
         watcher.join()
         os.close(reader)
+
+
+def reported(work: Callable[[], int | None], advice: str) -> int:
+    """Do a command's work, or say in a line on standard error why it ended.
+
+    Parameters
+    ----------
+    work : callable
+        Its exit code, if it returns one, is that of the command.
+    advice : str
+        What to do after a signal.
+
+    Returns
+    -------
+    int
+        Exit code: the work's, 1 after an error of this package, or 128 and the number of a signal.
+    """
+    try:
+        with interruptible(advice):
+            return work() or 0
+    except MpmoptError as error:
+        print(f"{type(error).__name__}: {error}", file=sys.stderr)
+        return 1
+    except Interrupted as interrupted:
+        print(f"\n{interrupted}. {advice}", file=sys.stderr)
+        return interrupted.code
+
+
+def how_to_go_on(path: Path) -> str:
+    """Advice to someone whose run was interrupted."""
+    return f"Every evaluation is saved; go on with: python -m mpmopt resume {path}"

@@ -18,7 +18,7 @@ from mpmopt import runfile
 from mpmopt.binary import Drawing
 from mpmopt.case import RESULTS, Case, run
 from mpmopt.errors import RunFileError, SweepError
-from mpmopt.files import locked, make_folder, replace_file
+from mpmopt.files import locked, make_folder, refuse_foreign, replace_file
 from mpmopt.optimize import Settings
 from mpmopt.scene import Design, Scene
 from mpmopt.sweeps import as_csv, connected, refuse_stuck, sweep
@@ -138,10 +138,13 @@ def multistart(
     SweepError
         If no start came to an end, or the drawing cannot travel to other processes.
     StorageError
-        If the folder cannot be written to, or another process is at work in it.
+        If the folder cannot be written to or holds foreign files of those names, or another process
+        is at work in it.
     """
     out = Path(out).absolute()
     make_folder(out)
+    table, picture = out / "starts.csv", out / "starts.png"
+    refuse_foreign((table, picture), force or (out / "starts.h5").exists())
     plan = {
         "scene": case.scene.to_json(),
         "settings": dataclasses.asdict(case.settings),
@@ -172,8 +175,8 @@ def multistart(
     if not rows:
         raise SweepError(f"no start came to an end\n{failed}")
     plain = [{name.replace("_", " "): value for name, value in row.items()} for row in rows]
-    replace_file(out / "starts.csv", as_csv(plain, digits=4).encode())
-    draw(out / "starts.png", out, rows)
+    replace_file(table, as_csv(plain, digits=4).encode())
+    draw(picture, out, rows)
     return failed + report(rows)
 
 

@@ -27,7 +27,7 @@ from mpmopt.schematic import schematic
 
 logger = logging.getLogger(__name__)
 
-PICTURES = 5  # that `plot_run` draws
+PICTURES = ("schematic", "history", "design", "post_processed", "reference")
 
 
 def plot_motion(path: Path, body: Body, pictures: int = 8) -> None:
@@ -91,6 +91,11 @@ def overview(run: Optimisation) -> Figure:
     return figure
 
 
+def pictures(folder: Path) -> list[Path]:
+    """The files that `plot_run` writes to a folder."""
+    return [folder / f"{name}.png" for name in PICTURES]
+
+
 def plot_run(folder: Path, run: RunFile, progress: Callable[[Path], None] | None = None) -> None:
     """Write all pictures of a run to a folder.
 
@@ -113,15 +118,14 @@ def plot_run(folder: Path, run: RunFile, progress: Callable[[Path], None] | None
         If a file cannot be written.
     """
     problem, x = run.problem(), run.best
-    pictures: dict[str, Callable[[Path], None]] = {
-        "schematic": lambda path: replace_file(path, png(schematic(run.scene))),
-        "history": lambda path: plot_history(path, run.run),
-        "design": lambda path: plot_motion(path, optimised(problem, x)),
-        "post_processed": lambda path: plot_motion(path, post_processed(problem, x)),
-        "reference": lambda path: plot_motion(path, reference(problem, x)),
-    }
-    for name, draw in pictures.items():
-        path = folder / f"{name}.png"
+    draws: tuple[Callable[[Path], None], ...] = (
+        lambda path: replace_file(path, png(schematic(run.scene))),
+        lambda path: plot_history(path, run.run),
+        lambda path: plot_motion(path, optimised(problem, x)),
+        lambda path: plot_motion(path, post_processed(problem, x)),
+        lambda path: plot_motion(path, reference(problem, x)),
+    )
+    for path, draw in zip(pictures(folder), draws):
         try:
             draw(path)
         except SimulationError as error:

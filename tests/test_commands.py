@@ -91,7 +91,7 @@ def test_exit_codes_are_those_of_the_help(tmp_path, monkeypatch, capsys):
 
     monkeypatch.setattr(runfile, "read", interrupted)
     assert commands.main(["verify", "run.h5"]) == 143
-    assert capsys.readouterr().err == "\nstopped by SIGTERM.\n"
+    assert capsys.readouterr().err == "\nstopped by SIGTERM. Files are complete or absent.\n"
 
 
 def test_each_command_refuses_a_run_without_a_design(short_run, tmp_path, capsys):
@@ -101,3 +101,31 @@ def test_each_command_refuses_a_run_without_a_design(short_run, tmp_path, capsys
         assert commands.main(first_example(name, path)) == 1
         assert "no design: no evaluation succeeded yet" in capsys.readouterr().err
     assert [file.name for file in tmp_path.iterdir()] == ["run.h5"]
+
+
+WRITES = {
+    "plot": (["--out"], "reference.png"),
+    "film": (["--seconds", "0.4", "--out"], "film.gif"),
+    "film --mp4": (["--seconds", "0.4", "--mp4", "--out"], "film.mp4"),
+    "export": (["--svg", "--width", "60", "--out"], "design.svg"),
+}
+
+
+@pytest.mark.parametrize("name", WRITES)
+def test_foreign_files_are_replaced_only_by_force(short_path, tmp_path, capsys, name):
+    options, written = WRITES[name]
+    file = tmp_path / written
+    out = file if name.startswith("film") else tmp_path
+    words = [name.split()[0], str(short_path), *options, str(out)]
+    file.write_text("somebody's")
+    assert commands.main(words) == 1
+    assert capsys.readouterr().err.startswith(f"StorageError: {file} is there already; choose")
+    assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [
+        (written, "somebody's")
+    ]
+    assert commands.main([*words, "--force"]) == 0
+    made = file.read_bytes()
+    assert len(made) > 100
+    # Pictures are made anew at will; people work on drawings.
+    assert commands.main(words) == (1 if name == "export" else 0)
+    assert file.read_bytes() == made

@@ -399,7 +399,7 @@ def run_file(path, problem, x):
 def test_the_command_writes_all_four_and_says_how_large_it_all_is(holed, tmp_path):
     path = run_file(tmp_path / "run.h5", *holed)
     (tmp_path / "design.svg").write_text("an older one")
-    options = ["--svg", "--dxf", "--stl", "--vtk", "--width", "60", "--drop-loose"]
+    options = ["--svg", "--dxf", "--stl", "--vtk", "--width", "60", "--drop-loose", "--force"]
     done = subprocess.run(
         [sys.executable, "-m", "mpmopt", "export", str(path), *options],
         capture_output=True, text=True, timeout=120, cwd=Path(__file__).parent.parent,

@@ -222,7 +222,8 @@ def test_an_interrupt_leaves_an_older_film_as_it_was(short_path, tmp_path, monke
         return frame(self, number)
 
     monkeypatch.setattr(Screen, "frame", interrupted)
-    assert main(["film", str(short_path), "--seconds", "0.4", "--out", str(target)]) == 130
+    options = ["--seconds", "0.4", "--out", str(target), "--force"]
+    assert main(["film", str(short_path), *options]) == 130
     assert [file.name for file in tmp_path.iterdir()] == [target.name]
     assert target.read_text() == "an older film"
 

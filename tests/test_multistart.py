@@ -194,6 +194,16 @@ def test_force_removes_nothing_that_it_cannot_replace(tmp_path):
     assert [file.read_text() for file in files] == 2 * ["somebody's work"]
 
 
+def test_foreign_tables_are_replaced_only_by_force(tmp_path):
+    table = tmp_path / "starts.csv"
+    table.write_text("somebody's")
+    with pytest.raises(StorageError, match=r"starts\.csv is there already.*--force"):
+        multistart.multistart(TINY, tmp_path, 1)
+    assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [
+        ("starts.csv", "somebody's")
+    ]
+
+
 def test_who_interrupts_is_told_to_go_on_without_force(tmp_path, capsys, monkeypatch):
     def stopped(*_):
         raise Interrupted(signal.SIGINT)

@@ -15,10 +15,10 @@ import pytest
 from conftest import small_scene
 
 from mpmopt import runfile
-from mpmopt.case import main, reported
+from mpmopt.case import main
 from mpmopt.errors import SimulationError, StorageError
 from mpmopt.files import locked, replace_file
-from mpmopt.interrupt import Interrupted, interruptible
+from mpmopt.interrupt import Interrupted, interruptible, reported
 from mpmopt.optimize import Settings, Stage, go_on, optimise
 from mpmopt.problem import Problem
 from mpmopt.seals import sealed
