@@ -77,9 +77,9 @@ def distance(scene: Scene, keep: NDArray[np.bool_], variables: Variables) -> flo
         If the simulation fails, its solid may be torn (`WHOLE`), or energy appears from nowhere.
     """
     simulation, objective = solid_body(scene, keep, variables)
-    state, margins = simulation.watch()
-    refuse_nonsense(margins, simulation, WHOLE)
-    return float(objective.value(state))
+    end = simulation.watch()
+    refuse_nonsense(end.margins, simulation, WHOLE)
+    return float(objective.value(end.state, end.before))
 
 
 def kept(problem: Problem, x: NDArray, threshold: float = THRESHOLD) -> NDArray[np.bool_]:

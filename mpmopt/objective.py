@@ -13,7 +13,10 @@ from mpmopt.particles import Particles
 
 @dataclass(frozen=True)
 class Objective:
-    """L = sum_p V_p J_p x_p.e / sum_p V_p J_p over solid and actuator particles (paper, sec. 2.4).
+    """Where the centroid c = sum_p V_p J_p x_p.e / sum_p V_p J_p of a body ends.
+
+    The sums are over solid and actuator particles. L is c at the end (paper, sec. 2.4); after a
+    transient it is c(end) - c(transient) + c(start), as if the body had stayed where it was.
 
     Attributes
     ----------
@@ -21,23 +24,39 @@ class Objective:
         Unit vector e.
     weight : (N,) array
         Reference volume of the particles that count, zero for designed ones.
+    start : float
+        Their centroid in the reference configuration.
     """
 
     direction: NDArray[np.float64]
     weight: NDArray[np.float64]
+    start: float
 
     @classmethod
     def of(cls, particles: Particles, direction: tuple[float, float]) -> Objective:
         """The objective of a body that shall go along `direction`."""
-        return cls(np.array(direction), np.where(particles.designed, 0.0, particles.volume))
+        weight = np.where(particles.designed, 0.0, particles.volume)
+        along = particles.position @ np.array(direction)
+        return cls(np.array(direction), weight, float(weight @ along / weight.sum()))
 
-    def value(self, state: NDArray) -> Any:
-        """L of a state (12, N), real or complex."""
+    def value(self, state: NDArray, before: NDArray | None = None) -> Any:
+        """L of a final state and, if there is one, of that after the transient.
+
+        Parameters
+        ----------
+        state, before : (12, N) arrays
+            Real or complex.
+        """
+        if before is not None:
+            return self.value(state) - (self.value(before) - self.start)
         volume = self.weight * (state[8] * state[11] - state[9] * state[10])
         return volume @ (self.direction @ state[0:2]) / volume.sum()
 
     def seed(self, state: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Derivative of L with respect to the state (12, N): where the reverse loop starts."""
+        """Derivative of c by a state (12, N): where the reverse loop starts.
+
+        L depends on the state after the transient by minus this.
+        """
         volume = self.weight * (state[8] * state[11] - state[9] * state[10])
         along = self.direction @ state[0:2]
         total = volume.sum()

@@ -271,10 +271,10 @@ class Problem:
 
     def _value(self, x: NDArray) -> Evaluation:
         simulation = self.simulation(x)
-        state, margins = simulation.watch()
-        self._check(margins, simulation)
-        value = _finite(self.objective(simulation).value(state), simulation)
-        return Evaluation(value, np.empty(0), margins, self.scene.time_step)
+        end = simulation.watch()
+        self._check(end.margins, simulation)
+        value = _finite(self.objective(simulation).value(end.state, end.before), simulation)
+        return Evaluation(value, np.empty(0), end.margins, self.scene.time_step)
 
     def _value_and_gradient(self, x: NDArray[np.float64]) -> Evaluation:
         phi, a, theta, _ = self.split(x)
@@ -295,8 +295,11 @@ class Problem:
             forward = simulation.forward(checkpoints, memory)
             self._check(forward.margins, simulation)
             objective = self.objective(simulation)
-            value = float(_finite(objective.value(forward.state), simulation))
-            gradient = forward.reverse(objective.seed(forward.state))
+            state, before = forward.state, forward.before
+            value = float(_finite(objective.value(state, before), simulation))
+            gradient = forward.reverse(
+                objective.seed(state), None if before is None else -objective.seed(before)
+            )
         bars = np.zeros((3, len(self.particles.position)))
         bars[:, self.present(phi)] = gradient.density, gradient.lame_lambda, gradient.lame_mu
         phi_bar = self.chain.pullback(phi, *bars)

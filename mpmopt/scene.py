@@ -293,6 +293,9 @@ class Scene(_Checked):
         Time tau in which particles lose what the transfer to the grid and back smooths away: they
         keep a share exp(-time_step / tau) of it in every step, so that damping is a rate and not
         a matter of the step. Zero is the affine transfer, as in the paper: they keep nothing.
+    transient : float, optional
+        Time at the start in which travel does not count, so that a body which tips over once gains
+        nothing by it. Zero, as in the paper: all of it counts.
 
     Raises
     ------
@@ -313,6 +316,7 @@ class Scene(_Checked):
     filter_length: float = 0.0
     mirror: Mirror | None = None
     blend_time: float = 0.0
+    transient: float = 0.0
 
     def __post_init__(self) -> None:
         for name, kind in (("grid", Grid), ("material", Material)):
@@ -339,6 +343,7 @@ class Scene(_Checked):
             ),
             filter_length=number("Scene", "filter_length", self.filter_length),
             blend_time=number("Scene", "blend_time", self.blend_time),
+            transient=number("Scene", "transient", self.transient),
             filter_weights=_tuple(
                 "Scene",
                 "filter_weights",
@@ -358,13 +363,18 @@ class Scene(_Checked):
                 f"Scene: filter_weights sum to w0 + 4 w1 + 4 w2 = {w0 + 4 * w1 + 4 * w2:.15g}, "
                 "must sum to 1"
             )
-        for name in ("filter_length", "blend_time"):
+        for name in ("filter_length", "blend_time", "transient"):
             if getattr(self, name) < 0.0:
                 raise SceneError(f"Scene: {name} = {getattr(self, name):g} must not be negative")
         if self.filter_passes > MOST_PASSES:
             raise SceneError(
                 f"Scene: filter_length = {self.filter_length:g} takes {self.filter_passes} passes, "
                 f"more than {MOST_PASSES}; take a shorter one, or larger w1 and w2"
+            )
+        if not self.transient_steps < self.steps:
+            raise SceneError(
+                f"Scene: transient = {self.transient:g} leaves nothing of the duration "
+                f"{self.duration:g}; take more steps"
             )
         self._check_body()
         self._check_size()
@@ -591,6 +601,11 @@ class Scene(_Checked):
     def actuators(self) -> tuple[Actuator, ...]:
         """The actuators in the body's order, which is that of a, theta and b."""
         return tuple(region for region in self.body if isinstance(region, Actuator))
+
+    @property
+    def transient_steps(self) -> int:
+        """Steps after which travel counts."""
+        return round(min(self.transient / self.time_step, self.steps))
 
     @property
     def duration(self) -> float:

@@ -246,8 +246,8 @@ class Simulation:
             kept.append(mpm.ungrouped(states[0], *self.initial.shape))
         return kept[-1] if frames is None else np.array(kept)
 
-    def watch(self) -> tuple[NDArray, Margins]:
-        """Run forward and keep nothing: the final state (12, N), and how close the run came.
+    def watch(self) -> Watched:
+        """Run forward and keep nothing: how the run ends, and how close it came to failure.
 
         Raises
         ------
@@ -262,7 +262,8 @@ class Simulation:
             memory.advance(first, last)
             watcher.follow(memory.states, first, last)
             memory.states[0] = memory.states[last - first]
-        return mpm.ungrouped(memory.states[0], *self.initial.shape), watcher.margins
+        state = mpm.ungrouped(memory.states[0], *self.initial.shape)
+        return Watched(state, watcher.before, watcher.margins)
 
     def margins(self, records: NDArray) -> Margins:
         """Those of a state, as records of groups of particles (`mpm.grouped`), but for energy."""
@@ -361,19 +362,41 @@ class Simulation:
                 if schedule.all_stored:
                     segment.store(index, checkpoints)
                 segment.states[0] = segment.states[last - first]
-        return Forward(self, checkpoints, segment, watcher.margins)
+        return Forward(self, checkpoints, segment, watcher)
+
+
+class Watched(NamedTuple):
+    """How a run ended.
+
+    Attributes
+    ----------
+    state : (12, N) array
+        The final state.
+    before : (12, N) array or None
+        The state after the scene's transient, if it has one.
+    margins : Margins
+    """
+
+    state: NDArray
+    before: NDArray | None
+    margins: Margins
 
 
 class _Watcher:
-    """What is seen of a run: its margins up to the step that it reached."""
+    """What is seen of a run: its margins up to the step that it reached, and the transient's end."""
 
     def __init__(self, simulation: Simulation) -> None:
         self.simulation, self._seen = simulation, Margins()
+        self.before: NDArray | None = None
         self._balance = Balance(simulation.body, simulation.world, simulation.signal)
 
     def follow(self, states: NDArray, first: int, last: int) -> None:
         """Look at steps `first` to `last`, whose states are in slots 0, 1, ..."""
         self._balance.follow(states, first, last)
+        transient = self.simulation.scene.transient_steps
+        if first < transient <= last:
+            shape = self.simulation.initial.shape
+            self.before = mpm.ungrouped(states[transient - first], *shape)
         slots = [*range(-first % WATCH, last - first, WATCH)]
         if last == self.simulation.steps:
             slots.append(last - first)
@@ -524,6 +547,8 @@ class Forward:
     ----------
     state : (12, N) array
         The final state.
+    before : (12, N) array or None
+        The state after the scene's transient, if it has one.
     margins : Margins
     """
 
@@ -532,9 +557,9 @@ class Forward:
         simulation: Simulation,
         checkpoints: Checkpoints,
         memory: _Segment,
-        margins: Margins,
+        watcher: _Watcher,
     ) -> None:
-        self.margins = margins
+        self.before, self.margins = watcher.before, watcher.margins
         self._simulation, self._checkpoints, self._memory = simulation, checkpoints, memory
         self._reversed = False
         first, last = checkpoints.schedule.segments[-1]
@@ -548,8 +573,17 @@ class Forward:
             return len(self._memory.recomputed)
         return len(schedule.segments) - 1
 
-    def reverse(self, seed: NDArray[np.float64]) -> Gradient:
-        """Go back through all steps from `seed`, the objective's derivative by the final state.
+    def reverse(
+        self, seed: NDArray[np.float64], before: NDArray[np.float64] | None = None
+    ) -> Gradient:
+        """Go back through all steps from the objective's derivatives by states.
+
+        Parameters
+        ----------
+        seed : (12, N) array
+            By the final state.
+        before : (12, N) array, optional
+            By the state after the scene's transient.
 
         Raises
         ------
@@ -567,14 +601,17 @@ class Forward:
         bar = mpm.grouped(seed.astype(dtype), repeat=False)
         body_bar = mpm.BodyBar.zeros(len(simulation.body.mass), dtype)
         signal_bar = np.zeros_like(simulation.signal)
-        segments = schedule.segments
+        segments, transient = schedule.segments, simulation.scene.transient_steps
         for index in range(len(segments) - 1, -1, -1):
             first, last = segments[index]
             if last < schedule.steps:
                 memory.recall(index, first, last, self._checkpoints)
             part_bar = np.zeros((memory.blocks, *signal_bar[first:last].shape), dtype)
-            for stop in range(last - first, 0, -simulation.steps_per_call):
+            stop = last - first
+            while stop > 0:
                 start = max(0, stop - simulation.steps_per_call)
+                if start < transient - first < stop:
+                    start = transient - first
                 together(
                     memory.blocks,
                     (stop - start) * len(bar),
@@ -593,6 +630,9 @@ class Forward:
                     body_bar,
                     part_bar,
                 )
+                stop = start
+                if before is not None and first + start == transient:
+                    bar += mpm.grouped(before.astype(dtype), repeat=False)
             signal_bar[first:last] = part_bar.sum(axis=0)
         return Gradient(
             density=simulation.particles.volume * mpm.ungrouped(body_bar.mass, 1, count)[0],
