@@ -129,6 +129,7 @@ def plausible(draw: Any) -> dict[str, Any]:
         "grid": {"cells": list(cells), "dx": dx},
         "time_step": time_step,
         "steps": draw(st.integers(1, 20)),
+        "transient": draw(st.sampled_from([0.0, 0.0, 1.0, 19.0])) * time_step,
         "body": body,
         "walls": walls,
         "material": material,

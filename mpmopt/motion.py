@@ -95,7 +95,7 @@ class Motion:
     largest : float
         Largest size of all signals from start to end; 1 if there is none.
     objective : (F,) array
-        L, as if the motion ended there.
+        L, as if the motion ended there; during the scene's transient where it starts.
     """
 
     name: str
@@ -120,10 +120,15 @@ class Motion:
         """
         simulation, gamma = body.simulation, body.gamma
         scene, frames = simulation.scene, np.asarray(frames)
-        states = simulation.run([int(frame) for frame in frames])
+        transient = scene.transient_steps
+        wanted = sorted({*map(int, frames), transient})
+        found = dict(zip(wanted, simulation.run(wanted)))
+        states = np.array([found[int(frame)] for frame in frames])
+        before = found[transient] if transient else None
         objective = Objective.of(simulation.particles, scene.direction)
         actuator = simulation.particles.actuator
-        values = [float(objective.value(state)) for state in states]
+        counted = (found[max(int(frame), transient)] for frame in frames)
+        values = [float(objective.value(state, before)) for state in counted]
         if scene.mirror is not None:
             states = np.array([with_image(state, scene.mirror) for state in states])
             gamma, actuator = np.tile(gamma, 2), np.tile(actuator, 2)

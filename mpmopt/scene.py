@@ -399,7 +399,7 @@ class Scene(_Checked):
             f"Scene of {nx} x {ny} cells {self.grid.dx:g} wide, {self.steps} steps of "
             f"{self.time_step:g}: a body of regions {body}{mirror}; "
             f"free where {walls or 'the grid is'}; gravity ({gx:g}, {gy:g}); to travel along "
-            f"({ex:g}, {ey:g})"
+            f"({ex:g}, {ey:g}){f' after {self.transient:g}' if self.transient else ''}"
         )
 
     def _repr_png_(self) -> bytes:

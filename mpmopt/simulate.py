@@ -383,7 +383,7 @@ class Watched(NamedTuple):
 
 
 class _Watcher:
-    """What is seen of a run: its margins up to the step that it reached, and the transient's end."""
+    """What is seen of a run: its margins so far, and the state after the transient."""
 
     def __init__(self, simulation: Simulation) -> None:
         self.simulation, self._seen = simulation, Margins()

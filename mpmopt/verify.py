@@ -513,8 +513,13 @@ def taylor_test(
 def contact_free(scene: Scene, steps: int = 200) -> Scene:
     """The first steps of a scene without its walls and gravity, so that nothing is ever touched."""
     no_walls: tuple[Wall, ...] = ()
+    steps = min(steps, scene.steps)
     return dataclasses.replace(
-        scene, steps=min(steps, scene.steps), walls=no_walls, gravity=(0.0, 0.0)
+        scene,
+        steps=steps,
+        walls=no_walls,
+        gravity=(0.0, 0.0),
+        transient=min(scene.transient, 0.5 * steps * scene.time_step),
     )
 
 

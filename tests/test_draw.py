@@ -82,6 +82,16 @@ def test_actuators_have_the_colour_of_their_signal_at_each_instant():
     assert np.all(motion.actuation[:, body.simulation.particles.actuator < 0] == 0.0)
 
 
+def test_a_motion_tells_how_far_it_counts_at_each_instant():
+    scene = small_scene(steps=30, transient=10 * 4e-3)
+    problem = Problem(scene)
+    x = problem.join(0.3, 1.0, -0.3, -0.5)
+    start, *before, last = Motion.of(optimised(problem, x), [0, 4, 10, 17, 30]).objective
+    assert before[:2] == [start, start]
+    assert before[2] != start
+    assert last == problem.value(x)
+
+
 def test_solid_is_drawn_above_void():
     motion = made_up([(0.2, 0.2), (0.2, 0.2)], 2 * [np.eye(2)], [1.0, 0.1], [0.0, 0.0])
     _, colour = drawn(motion, [(0.1, 0.1), (0.3, 0.3)])

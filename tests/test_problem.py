@@ -8,6 +8,7 @@ from conftest import small_scene, worst
 from walker import walker
 
 from mpmopt.binary import distance, farthest, full_block, pieces, post_processed
+from mpmopt.checkpoints import Checkpointing
 from mpmopt.errors import DesignError, SimulationError
 from mpmopt.problem import Problem
 from mpmopt.verify import COMPLEX_STEP, COMPLEX_TOLERANCE, complex_step_test
@@ -48,6 +49,22 @@ def test_gradient_in_a_slanted_direction_and_three_particles_a_cell():
     problem = Problem(scene)
     x = problem.join(0.1, [0.9, 0.5], [-0.3, 0.2], [-0.5, 0.1])
     assert worst(complex_step_test(problem, x)) <= COMPLEX_TOLERANCE
+
+
+@pytest.mark.parametrize("first", [1, 7, 20, 29])
+def test_after_a_transient_only_what_follows_counts_and_the_gradient_is_exact(first, x):
+    scene = small_scene(steps=30, direction=(0.6, -0.8))
+    whole = Problem(scene, beta=2.0)
+    part = Problem(dataclasses.replace(scene, transient=first * scene.time_step), beta=2.0)
+    simulation = whole.simulation(x)
+    start, before, end = map(whole.objective(simulation).value, simulation.run([0, first, 30]))
+    value, gradient = part.value_and_gradient(x)
+    assert value == part.value(x) == pytest.approx(end - before + start, abs=1e-15)
+    assert abs(value - whole.value(x)) > 1e-5
+    assert worst(complex_step_test(part, x)) <= COMPLEX_TOLERANCE
+    for every in (1, 7, 10, "all"):
+        other = Problem(part.scene, 2.0, Checkpointing(every, store="memory"))
+        assert np.array_equal(other.value_and_gradient(x)[1], gradient)
 
 
 def test_void_that_is_left_out_is_not_simulated_and_the_gradient_stays_exact(problem, x):

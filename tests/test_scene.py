@@ -83,6 +83,8 @@ C = 1 / 16
         (lambda: small_scene(direction=(1.0, 1.0)), ["1.41421356", "length 1"]),
         (lambda: small_scene(filter_weights=(0.5, 0.1, 0.1)), ["1.3", "sum to 1"]),
         (lambda: small_scene(filter_length=-0.1), ["filter_length", "-0.1"]),
+        (lambda: small_scene(transient=-0.1), ["transient", "-0.1"]),
+        (lambda: small_scene(steps=30, transient=0.119), ["0.119", "0.12", "more steps"]),
         (lambda: small_scene(filter_length=2.0), ["5118 passes", "200"]),
         (lambda: small_scene(body=()), ["no Solid and no Actuator"]),
         (lambda: small_scene(body=(Design((3 * C, 4 * C), (6 * C, 6 * C)),)), ["objective"]),

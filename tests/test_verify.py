@@ -99,6 +99,9 @@ def test_every_wrong_adjoint_fails_every_check_that_can_see_it(verdicts):
     assert len(wrong) >= 15
     # Taylor's window has no walls.
     assert wrong.pop("wall forgotten") == {"dot": False, "complex step": False, "Taylor": True}
+    # No kernel knows of it.
+    forgotten = {"dot": True, "complex step": False, "Taylor": False}
+    assert wrong.pop("transient forgotten") == forgotten
     passed = {
         name: [check for check, ok in verdict.items() if ok]
         for name, verdict in wrong.items()

@@ -7,6 +7,7 @@ place of the real one.
 import json
 import sys
 import types
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -86,6 +87,7 @@ def verdicts(scene, x) -> dict[str, bool]:
 
 def main() -> None:
     scene = small_scene(particles_per_cell=1, steps=8, blend_time=5e-3)
+    scene = replace(scene, transient=3 * scene.time_step)
     p = Problem(scene)
     rng = np.random.default_rng(0)
     x = p.join(rng.uniform(-0.5, 0.5, 8), [0.6, 0.5], [-0.3, 0.2], [-0.5, 0.4])
@@ -105,6 +107,12 @@ def main() -> None:
             actuation,
             "signal_adjoint",
             scaled(actuation.signal_adjoint),
+        ),
+        (
+            "transient forgotten",
+            simulate.Forward,
+            "reverse",
+            lambda self, seed, before, reverse=simulate.Forward.reverse: reverse(self, seed),
         ),
         (
             "volume in the objective",
