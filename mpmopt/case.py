@@ -390,8 +390,10 @@ def main(description: str, cases: Mapping[str, Case], argv: list[str] | None = N
     choice = parser.add_mutually_exclusive_group() if len(cases) > 1 else parser
     for name, case in cases.items():
         if name != "default":
-            n, dt = case.scene.grid.cells[0], case.scene.time_step
-            text = f"n = {n}, dt = {dt:g} instead of the default setting"
+            scene = case.scene
+            text = f"n = {scene.grid.cells[0]}, dt = {scene.time_step:g}"
+            if scene.transient:
+                text += f", travel counts from t = {scene.transient:g} to {scene.duration:g}"
             choice.add_argument(
                 f"--{name}", dest="setting", action="store_const", const=name, help=text
             )
