@@ -26,7 +26,7 @@ from mpmopt import __version__
 from mpmopt.errors import DesignError
 from mpmopt.interrupt import how_to_go_on, reported
 
-REPLACE = "replace files of that name that mpmopt did not make"
+REPLACE = "replace files of that name even if mpmopt did not make them"
 
 
 def plot(path: Path, out: Path | None, force: bool) -> int:
@@ -38,9 +38,10 @@ def plot(path: Path, out: Path | None, force: bool) -> int:
 
     run = runfile.read(path)
     folder = out or path.parent
-    refuse_foreign(pictures(folder), force)
     make_folder(folder)
-    with Progress("pictures", len(pictures(folder))) as progress:
+    files = pictures(folder)
+    refuse_foreign(files, force)
+    with Progress("pictures", len(files)) as progress:
 
         def written(picture: Path) -> None:
             progress.step(picture.name)
@@ -60,8 +61,8 @@ def film(path: Path, out: Path | None, mp4: bool, seconds: float | None, force: 
         raise DesignError(f"--mp4 does not write {out}: leave --mp4 out, or let FILE end in .mp4")
     run = runfile.read(path)
     target = out or path.parent / ("film.mp4" if mp4 else "film.gif")
-    refuse_foreign([target], force)
     make_folder(target.parent)
+    refuse_foreign([target], force)
     print(f"{target}: {filmed(target, run, seconds)}")
     return 0
 
@@ -189,10 +190,11 @@ def export(path: Path, out: Path | None, force: bool, **options: Any) -> int:
     from mpmopt import runfile
     from mpmopt.export import FILES, size
     from mpmopt.export import export as exported
-    from mpmopt.files import refuse_foreign
+    from mpmopt.files import make_folder, refuse_foreign
 
     run = runfile.read(path)
     folder = out or path.parent
+    make_folder(folder)
     refuse_foreign((folder / FILES[name] for name in options["formats"]), force)
     done = exported(run.problem(), run.best, folder, **options)
     for file in done.paths:
@@ -213,7 +215,7 @@ def main(argv: list[str] | None = None) -> int:
     """Run a command; the exit code is one of those in the module's text."""
     arguments = _parser().parse_args(argv)
     logging.basicConfig(format="%(message)s")
-    return reported(lambda: arguments.do(arguments), arguments.advice(arguments.path))
+    return reported(lambda: arguments.do(arguments), lambda: arguments.advice(arguments.path))
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -363,7 +365,9 @@ def _parser() -> argparse.ArgumentParser:
         "--drop-loose", action="store_true", help="leave out pieces that hang on nothing"
     )
     command.add_argument("--out", type=Path, metavar="DIR", help="folder (default: the run's)")
-    command.add_argument("--force", action="store_true", help="replace earlier exports")
+    command.add_argument(
+        "--force", action="store_true", help="replace files of those names, whoever made them"
+    )
     command.set_defaults(
         do=lambda arguments: export(
             **{k: v for k, v in vars(arguments).items() if k not in ("do", "advice")}

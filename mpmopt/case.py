@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 import logging
-import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,7 +20,7 @@ from mpmopt.checkpoints import Checkpointing
 from mpmopt.errors import DesignError, RunFileError, SimulationError, StorageError
 from mpmopt.files import locked, make_folder, refuse_foreign, replace_file
 from mpmopt.history import Optimisation
-from mpmopt.interrupt import how_to_go_on, reported
+from mpmopt.interrupt import how_to_go_on, reported, say
 from mpmopt.optimize import Settings, Stage, begin, go_on
 from mpmopt.particles import lay_out
 from mpmopt.problem import Problem, Variables
@@ -187,7 +186,7 @@ def run(
     MpmoptError
         As `optimise` does.
     """
-    path = out / "run.h5"
+    path = (out / "run.h5").resolve()
     first = case.settings.stages[0]
     problem = Problem(first.scene(case.scene), first.beta)
     turns = QUARTER_TURNS if case.settings.scouting else (0.0,)
@@ -233,6 +232,7 @@ def resume(path: Path, checkpointing: Checkpointing | None = None) -> dict[str, 
     MpmoptError
         As `optimise` does.
     """
+    path = path.resolve()  # a link would be replaced instead of what it leads to
     with locked(path):
         return _go_on(path, runfile.read(path), checkpointing)
 
@@ -250,12 +250,12 @@ def _go_on(
     path: Path, kept: runfile.RunFile, checkpointing: Checkpointing | None
 ) -> dict[str, Any]:
     if kept.summary:
-        print(f"{path} holds a finished run.", file=sys.stderr)
+        say(f"{path} holds a finished run.")
         return kept.summary
     if kept.versions != runfile.versions():
         logger.warning("%s was begun with %s: digits may differ", path, kept.versions)
     if kept.run.history:
-        print(f"Going on after {len(kept.run.history)} evaluations.", file=sys.stderr)
+        say(f"Going on after {len(kept.run.history)} evaluations.")
 
     def save(current: Optimisation) -> None:
         runfile.write(path, current, drawing=kept.drawing)
@@ -411,7 +411,7 @@ def main(description: str, cases: Mapping[str, Case], argv: list[str] | None = N
         if arguments.scheduler:
             parser.error("--scheduler is for --starts: one run is one process")
         return reported(
-            lambda: print(table(run(case, out, force=force))), how_to_go_on(out / "run.h5")
+            lambda: print(table(run(case, out, force=force))), lambda: how_to_go_on(out / "run.h5")
         )
     if arguments.starts < 1:
         parser.error(f"--starts {arguments.starts}: at least 1")
@@ -419,5 +419,5 @@ def main(description: str, cases: Mapping[str, Case], argv: list[str] | None = N
 
     return reported(
         lambda: print(multistart(case, out, arguments.starts, arguments.scheduler, force)),
-        "Every evaluation is saved; the same command without --force goes on.",
+        lambda: "Every evaluation is saved; the same command without --force goes on.",
     )

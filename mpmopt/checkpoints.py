@@ -303,6 +303,7 @@ def _is_store(path: Path) -> bool:
     """Whether a file holds checkpoints of an earlier run."""
     try:
         with h5py.File(path, "r") as file:
-            return bool(file.attrs.get("format") == FORMAT)
+            found = file.attrs.get("format")
+            return isinstance(found, str) and found == FORMAT
     except OSError:
         return False

@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import logging
 import os
+import re
 import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -15,7 +16,8 @@ from mpmopt.errors import StorageError
 
 logger = logging.getLogger(__name__)
 
-MARK = "made by mpmopt"  # in the metadata of pictures and films
+MARK = "made by mpmopt"  # in the metadata of pictures and films, within their first bytes
+HEAD = 10_000
 
 
 def replace_file(path: Path, content: bytes) -> None:
@@ -44,14 +46,14 @@ def replace_file(path: Path, content: bytes) -> None:
 
 
 def refuse_foreign(paths: Iterable[Path], force: bool = False) -> None:
-    """Refuse to replace files that others made or may have edited: all that have no `MARK`.
+    """Refuse to replace files that others made: all that have no `MARK`.
 
     Raises
     ------
     StorageError
         If some are there, and it is not forced.
     """
-    foreign = [str(path) for path in paths if path.exists() and not _is_marked(path)]
+    foreign = [str(path) for path in paths if os.path.lexists(path) and not _is_marked(path)]
     if foreign and not force:
         raise StorageError(
             f"{', '.join(foreign)} {'are' if foreign[1:] else 'is'} there already; choose another "
@@ -60,9 +62,12 @@ def refuse_foreign(paths: Iterable[Path], force: bool = False) -> None:
 
 
 def _is_marked(path: Path) -> bool:
+    if not path.is_file():  # a pipe would be waited for
+        return False
     try:
-        return MARK.encode() in path.read_bytes()
-    except OSError:  # such as a folder
+        with path.open("rb") as file:
+            return MARK.encode() in file.read(HEAD)
+    except OSError:
         return False
 
 
@@ -112,9 +117,11 @@ def locked(path: Path) -> Iterator[None]:
             ) from error
         except OSError as error:
             logger.warning("no lock on %s: %s; start no second process there", path, error)
-        for left in path.parent.glob(f"{_unfinished(path)}*"):
-            with suppress(OSError):
-                left.unlink()
+        unfinished = re.compile(re.escape(_unfinished(path)) + "[0-9a-f]{32}")
+        for left in path.parent.iterdir():
+            if unfinished.fullmatch(left.name):
+                with suppress(OSError):
+                    left.unlink()
         yield
     finally:
         os.close(folder)

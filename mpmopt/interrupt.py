@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import os
+import shlex
 import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from pickle import UnpicklingError
 from types import FrameType
+from typing import TextIO
 
 from mpmopt.errors import MpmoptError
 
@@ -33,7 +36,7 @@ class Interrupted(KeyboardInterrupt):
 
 
 @contextmanager
-def interruptible(advice: str) -> Iterator[None]:
+def interruptible(advice: Callable[[], str]) -> Iterator[None]:
     """Raise `Interrupted` where the main thread is at a signal, and end the process if that hangs.
 
     What is saved is saved at all times (`files.replace_file`), so nothing is lost by an end where
@@ -41,14 +44,19 @@ def interruptible(advice: str) -> Iterator[None]:
 
     Parameters
     ----------
-    advice : str
-        What to print if the process is ended from outside the main thread.
+    advice : callable
+        Gives what to print if the process is ended from outside the main thread.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
 
+    heard: list[int] = []
+
     def raise_it(number: int, frame: FrameType | None) -> None:
+        for each in SIGNALS:  # a second one shall not spoil what the first one ends
+            signal.signal(each, signal.SIG_IGN)
+        heard.append(number)
         raise Interrupted(number)
 
     reader, writer = os.pipe()
@@ -62,7 +70,7 @@ def interruptible(advice: str) -> Iterator[None]:
         if not number or over.wait(GRACE):
             return
         interrupted = Interrupted(number[0])
-        print(f"\n{interrupted}. {advice}", file=sys.stderr, flush=True)
+        say(f"\n{interrupted}. {advice()}")
         os._exit(interrupted.code)
 
     handlers = {number: signal.signal(number, raise_it) for number in SIGNALS}
@@ -71,6 +79,11 @@ def interruptible(advice: str) -> Iterator[None]:
     watcher.start()
     try:
         yield
+    except Exception as error:
+        # A callback of a compiler may swallow what is raised in it, and leave an error of its own.
+        if heard:
+            raise Interrupted(heard[0]) from error
+        raise
     finally:
         over.set()
         signal.set_wakeup_fd(before)
@@ -81,32 +94,64 @@ def interruptible(advice: str) -> Iterator[None]:
         os.close(reader)
 
 
-def reported(work: Callable[[], int | None], advice: str) -> int:
+def reported(work: Callable[[], int | None], advice: Callable[[], str]) -> int:
     """Do a command's work, or say in a line on standard error why it ended.
+
+    Where standard output has no reader, or there is no memory or no disk, that is said too.
 
     Parameters
     ----------
     work : callable
         Its exit code, if it returns one, is that of the command.
-    advice : str
-        What to do after a signal.
+    advice : callable
+        Gives what to do after a signal.
 
     Returns
     -------
     int
-        Exit code: the work's, 1 after an error of this package, or 128 and the number of a signal.
+        Exit code: the work's, 1 after an error, or 128 and the number of a signal.
     """
     try:
         with interruptible(advice):
-            return work() or 0
-    except MpmoptError as error:
-        print(f"{type(error).__name__}: {error}", file=sys.stderr)
+            code = work() or 0
+            if sys.stdout is not None:
+                sys.stdout.flush()
+            return code
+    except (EOFError, UnpicklingError) as error:  # only Numba reads such files
+        say(
+            f"{type(error).__name__}: {error}: the compiled kernels that Numba kept are damaged; "
+            "remove its *.nbi files, in __pycache__ of the package, ~/.cache/numba or "
+            "NUMBA_CACHE_DIR"
+        )
+        return 1
+    except (MpmoptError, OSError, MemoryError) as error:
+        say(f"{type(error).__name__}: {error}")
+        if sys.stdout is not None:
+            _abandon(sys.stdout)
         return 1
     except Interrupted as interrupted:
-        print(f"\n{interrupted}. {advice}", file=sys.stderr)
+        say(f"\n{interrupted}. {advice()}")
         return interrupted.code
+
+
+def say(line: str) -> None:
+    """Print a line on standard error, if anybody can read it: no run ends for want of a reader."""
+    if sys.stderr is not None:  # None: it was closed
+        with suppress(OSError):
+            print(line, file=sys.stderr, flush=True)
+
+
+def _abandon(stream: TextIO) -> None:
+    """Let nothing more be written to a stream that is broken, not even at exit."""
+    try:
+        stream.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def how_to_go_on(path: Path) -> str:
     """Advice to someone whose run was interrupted."""
-    return f"Every evaluation is saved; go on with: python -m mpmopt resume {path}"
+    if not path.exists():
+        return "Nothing was computed yet; the same command begins anew."
+    command = shlex.join(["python", "-m", "mpmopt", "resume", str(path)])
+    return f"Every evaluation is saved; go on with: {command}"

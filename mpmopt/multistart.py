@@ -144,7 +144,8 @@ def multistart(
     out = Path(out).absolute()
     make_folder(out)
     table, picture = out / "starts.csv", out / "starts.png"
-    refuse_foreign((table, picture), force or (out / "starts.h5").exists())
+    if not (out / "starts.h5").exists():
+        refuse_foreign((table, picture), force)
     plan = {
         "scene": case.scene.to_json(),
         "settings": dataclasses.asdict(case.settings),

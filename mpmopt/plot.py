@@ -118,14 +118,15 @@ def plot_run(folder: Path, run: RunFile, progress: Callable[[Path], None] | None
         If a file cannot be written.
     """
     problem, x = run.problem(), run.best
-    draws: tuple[Callable[[Path], None], ...] = (
-        lambda path: replace_file(path, png(schematic(run.scene))),
-        lambda path: plot_history(path, run.run),
-        lambda path: plot_motion(path, optimised(problem, x)),
-        lambda path: plot_motion(path, post_processed(problem, x)),
-        lambda path: plot_motion(path, reference(problem, x)),
-    )
-    for path, draw in zip(pictures(folder), draws):
+    draws: dict[str, Callable[[Path], None]] = {
+        "schematic": lambda path: replace_file(path, png(schematic(run.scene))),
+        "history": lambda path: plot_history(path, run.run),
+        "design": lambda path: plot_motion(path, optimised(problem, x)),
+        "post_processed": lambda path: plot_motion(path, post_processed(problem, x)),
+        "reference": lambda path: plot_motion(path, reference(problem, x)),
+    }
+    for path in pictures(folder):
+        draw = draws[path.stem]
         try:
             draw(path)
         except SimulationError as error:

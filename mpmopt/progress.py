@@ -7,6 +7,8 @@ import time
 
 from tqdm import tqdm
 
+from mpmopt.interrupt import say
+
 LINES = 10  # of a work whose size is known; of another, one in so many steps
 
 
@@ -29,7 +31,8 @@ class Progress:
     def __init__(self, unit: str, total: int | None = None) -> None:
         self._unit, self._total, self.count = unit, total, 0
         self._began = time.monotonic()
-        self._bar = tqdm(total=total, unit=f" {unit}", disable=not sys.stderr.isatty(), leave=False)
+        shown = sys.stderr is not None and sys.stderr.isatty()
+        self._bar = tqdm(total=total, unit=f" {unit}", disable=not shown, leave=False)
 
     def __enter__(self) -> Progress:
         return self
@@ -47,7 +50,7 @@ class Progress:
             of = f" of {self._total}" if self._total else ""
             seconds = time.monotonic() - self._began
             line = f"{self.count}{of} {self._unit}, {seconds:.0f} s"
-            print(f"{line}: {text}" if text else line, file=sys.stderr, flush=True)
+            say(f"{line}: {text}" if text else line)
 
     def close(self) -> None:
         """Remove the bar."""

@@ -240,8 +240,9 @@ def read(path: Path) -> RunFile:
         If it does not exist, is no run file, is damaged or of another version.
     """
     path = Path(path)
-    if not path.is_file():
-        raise RunFileError(f"{path} is not there; give the path of a run.h5")
+    with refusing(path, "run file", RunFileError):
+        if not path.is_file():
+            raise RunFileError(f"{path} is not there; give the path of a run.h5")
     with refusing(path, "run file", RunFileError), unsealed(path, "run file") as file:
         return _read(file, path)
 

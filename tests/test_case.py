@@ -215,8 +215,10 @@ def test_importing_the_package_imports_nothing_heavy(tmp_path):
 
 
 FALL = """
+import sys
 import numpy as np
 from mpmopt import mpm
+from mpmopt.interrupt import reported
 from mpmopt.particles import lay_out
 from mpmopt.problem import Problem
 from mpmopt.scene import Grid, Scene, Solid
@@ -224,8 +226,9 @@ scene = Scene(Grid((8, 8), 0.125), 1e-2, 10, gravity=(1.0, 0.0),
               body=(Solid((0.25, 0.25), (0.5, 0.5)),))
 start = lay_out(scene).position[:, 0].mean()
 stats = mpm.advance.stats
-print((Problem(scene, redo=0).value(np.empty(0)) - start).hex(),
-      sum(stats.cache_hits.values()), sum(stats.cache_misses.values()))
+sys.exit(reported(lambda: print((Problem(scene, redo=0).value(np.empty(0)) - start).hex(),
+                                sum(stats.cache_hits.values()), sum(stats.cache_misses.values())),
+                  lambda: ""))
 """
 
 
@@ -245,6 +248,10 @@ def test_kernels_come_from_the_cache_to_the_same_bits_but_never_once_edited(tmp_
     edited, *_ = start_up(tmp_path, FALL, tmp_path)
     assert float.fromhex(cold) > 0.0
     assert float.fromhex(edited) == pytest.approx(2.0 * float.fromhex(cold), rel=1e-12)
+    for index in (tmp_path / "cache").rglob("*.nbi"):
+        os.truncate(index, 0)
+    with pytest.raises(AssertionError, match=r"^EOFError: .* remove its \*\.nbi files"):
+        start_up(tmp_path, FALL, tmp_path)
 
 
 def test_the_example_in_the_readme_goes_farther(capsys):

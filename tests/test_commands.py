@@ -3,6 +3,7 @@
 import argparse
 import configparser
 import importlib
+import os
 import re
 import shlex
 import signal
@@ -129,3 +130,46 @@ def test_foreign_files_are_replaced_only_by_force(short_path, tmp_path, capsys, 
     # Pictures are made anew at will; people work on drawings.
     assert commands.main(words) == (1 if name == "export" else 0)
     assert file.read_bytes() == made
+
+
+@pytest.mark.parametrize("kind", ["folder", "pipe", "link to nothing", "link to a device"])
+def test_what_is_no_file_of_ours_is_foreign_and_not_even_read(short_path, tmp_path, capsys, kind):
+    film = tmp_path / "film.gif"
+    if kind == "folder":
+        film.mkdir()
+    elif kind == "pipe":
+        os.mkfifo(film)
+    else:
+        film.symlink_to("/dev/zero" if kind == "link to a device" else tmp_path / "nothing")
+    assert commands.main(["film", str(short_path), "--out", str(film)]) == 1
+    assert capsys.readouterr().err.startswith(f"StorageError: {film} is there already")
+
+
+def test_a_place_that_cannot_be_is_an_error_in_a_line(short_path, tmp_path, capsys):
+    for command in ("plot", "film", "export --svg --width 60"):
+        name, *options = command.split()
+        out = tmp_path / (300 * "x") / "film.gif"
+        assert commands.main([name, str(short_path), *options, "--out", str(out)]) == 1
+        assert capsys.readouterr().err.startswith("StorageError: cannot write to")
+        assert commands.main([name, str(out), *options]) == 1
+        assert capsys.readouterr().err.startswith("RunFileError: ")
+
+
+def test_a_reader_that_goes_away_is_an_error_in_a_line(short_path):
+    reader, writer = os.pipe()
+    os.close(reader)
+    done = subprocess.run(
+        [sys.executable, "-m", "mpmopt", "postprocess", str(short_path)],
+        stdout=writer, stderr=subprocess.PIPE, text=True, timeout=120, cwd=ROOT,
+    )  # fmt: skip
+    os.close(writer)
+    assert (done.returncode, done.stderr) == (1, "BrokenPipeError: [Errno 32] Broken pipe\n")
+
+
+def test_nobody_needs_to_listen_to_progress(short_path, tmp_path):
+    film = tmp_path / "film.gif"
+    command = f"{sys.executable} -m mpmopt film {short_path} --seconds 0.4 --out {film}"
+    for stream in ("2>&-", ">&- 2>&-", "2>/dev/full"):
+        done = subprocess.run(f"{command} {stream}", shell=True, timeout=120, cwd=ROOT)
+        assert done.returncode == 0
+        film.unlink()

@@ -6,7 +6,10 @@ import random
 import signal
 import subprocess
 import sys
+import time
+from contextlib import suppress
 from pathlib import Path
+from uuid import uuid4
 
 import faults
 import h5py
@@ -18,7 +21,7 @@ from mpmopt import runfile
 from mpmopt.case import main
 from mpmopt.errors import SimulationError, StorageError
 from mpmopt.files import locked, replace_file
-from mpmopt.interrupt import Interrupted, interruptible, reported
+from mpmopt.interrupt import Interrupted, how_to_go_on, interruptible, reported
 from mpmopt.optimize import Settings, Stage, go_on, optimise
 from mpmopt.problem import Problem
 from mpmopt.seals import sealed
@@ -103,7 +106,7 @@ def test_a_signal_ends_a_run_with_its_code_and_says_how_to_go_on(whole, tmp_path
 HANGS = """
 import ctypes
 from mpmopt.interrupt import interruptible
-with interruptible("Advice."):
+with interruptible(lambda: "Advice."):
     mutex, library = ctypes.create_string_buffer(64), ctypes.CDLL(None)
     library.pthread_mutex_lock(mutex)
     try:
@@ -127,9 +130,49 @@ def test_a_call_that_does_not_return_is_ended_from_outside():
     assert "stopped by SIGTERM. Advice." in text
 
 
+def test_a_signal_that_a_library_swallows_is_not_lost():
+    with pytest.raises(Interrupted, match="SIGTERM"), interruptible(lambda: "none"):
+        with suppress(Interrupted):  # as in a callback of a compiler
+            os.kill(os.getpid(), signal.SIGTERM)
+        raise RuntimeError("no compiled object yet")
+
+
+def test_of_two_signals_the_first_one_ends_the_run():
+    with pytest.raises(Interrupted, match="SIGINT"), interruptible(lambda: "none"):
+        try:
+            os.kill(os.getpid(), signal.SIGINT)
+        finally:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+
+def test_a_signal_ends_going_on_too_and_says_how_to_go_on(whole, tmp_path):
+    process = faults.Process(tmp_path / "out")
+    assert process.wait_for("reverse")
+    process.end(signal.SIGKILL)
+    file = tmp_path / "out" / "run.h5"
+    before = file.stat().st_mtime_ns
+    command = [sys.executable, "-m", "mpmopt", "resume", str(file)]
+    going_on = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    while file.stat().st_mtime_ns == before and going_on.poll() is None:
+        time.sleep(0.01)
+    going_on.send_signal(signal.SIGTERM)
+    _, text = going_on.communicate(timeout=50)
+    assert going_on.returncode == 143
+    assert f"go on with: python -m mpmopt resume {file}\n" in text
+    assert faults.resumed(tmp_path / "out") == whole
+
+
+def test_the_advice_can_be_typed_and_is_true(tmp_path):
+    path = tmp_path / "my run" / "run.h5"
+    assert how_to_go_on(path) == "Nothing was computed yet; the same command begins anew."
+    path.parent.mkdir()
+    path.touch()
+    assert how_to_go_on(path).endswith(f"mpmopt resume '{path}'")
+
+
 def test_signals_are_given_back():
     before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
-    with pytest.raises(Interrupted, match="SIGTERM"), interruptible("none"):
+    with pytest.raises(Interrupted, match="SIGTERM"), interruptible(lambda: "none"):
         os.kill(os.getpid(), signal.SIGTERM)
     assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before
 
@@ -138,7 +181,7 @@ def test_an_error_is_one_line_and_exit_code_one(capsys):
     def refuse():
         raise StorageError("no room")
 
-    assert reported(refuse, "Go on.") == 1
+    assert reported(refuse, lambda: "Go on.") == 1
     assert capsys.readouterr().err == "StorageError: no room\n"
 
 
@@ -163,14 +206,17 @@ def test_a_second_process_on_a_run_is_refused(whole, tmp_path):
 
 
 def test_a_lock_ends_and_leaves_nothing(tmp_path):
-    (tmp_path / ".run.h5-killed").write_text("half a file")
-    (tmp_path / ".other.h5-x").write_text("somebody's")
+    (tmp_path / f".run.h5-{uuid4().hex}").write_text("half a file")
+    for name in (f".other.h5-{uuid4().hex}", ".run.h5-backup"):
+        (tmp_path / name).write_text("somebody's")
     path = tmp_path / "run.h5"
     with locked(path), pytest.raises(StorageError, match="another process"), locked(path):
         pass
     with locked(path):
         replace_file(path, b"1")
-    assert sorted(item.name for item in tmp_path.iterdir()) == [".other.h5-x", "run.h5"]
+    *others, mine = sorted(item.name for item in tmp_path.iterdir())
+    assert [name.partition("-")[0] for name in others] == [".other.h5", ".run.h5"]
+    assert (others[1], mine) == (".run.h5-backup", "run.h5")
 
 
 @pytest.mark.parametrize(("umask", "mode"), [(0o022, 0o644), (0o077, 0o600)])
