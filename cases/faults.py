@@ -39,7 +39,7 @@ from mpmopt.optimize import Settings, Stage
 from mpmopt.sweeps import as_csv
 
 SMALL = case.Case(
-    dataclasses.replace(walker(64, 8e-4), steps=400),
+    dataclasses.replace(walker(64, 8e-4), steps=200),
     Settings(
         (
             Stage(0.5, 1e-2, 1e-3, 1.6e-3, coarsening=2),
@@ -171,7 +171,7 @@ def kills(folder: Path, whole: dict[str, Any], count: int, dice: random.Random) 
             process = Process(out)
             begun = process.wait_for("forward")
             wanted = dice.choice(("forward", "reverse", "write", "anything"))
-            time.sleep(dice.uniform(0.0, 1.5))
+            time.sleep(dice.uniform(0.0, 1.0))
             if wanted != "anything":
                 process.wait_for(wanted, seconds=5.0)
             phase = process.at()

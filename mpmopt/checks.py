@@ -73,3 +73,10 @@ def count(
     if not least <= value <= most:
         raise error(f"{owner}: {name} = {shown(value)} must be from {least} to {most:.3g}")
     return int(value)
+
+
+def flag(owner: str, name: str, value: Any, *, error: type[MpmoptError] = SceneError) -> bool:
+    """`value` as True or False, or an error."""
+    if not isinstance(value, (bool, np.bool_)):
+        raise error(f"{owner}: {name} = {shown(value)} must be True or False")
+    return bool(value)

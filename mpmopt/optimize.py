@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from mpmopt import audit
 from mpmopt.binary import post_processed
 from mpmopt.checkpoints import Checkpointing
-from mpmopt.checks import count, number, share
+from mpmopt.checks import count, flag, number, share
 from mpmopt.design import greyness
 from mpmopt.errors import DesignError, SceneError, SimulationError
 from mpmopt.history import Candidate, Iteration, Leg, Optimisation, StageState
@@ -88,6 +88,9 @@ class Stage:
             raise DesignError(f"Stage: move_limit = {self.move_limit} must be at most 1")
         leave_out = share("Stage", "leave_out", self.leave_out, error=DesignError)
         object.__setattr__(self, "leave_out", leave_out)
+        for name in ("solid", "audited"):
+            value = flag("Stage", name, getattr(self, name), error=DesignError)
+            object.__setattr__(self, name, value)
         if self.audited and not self.solid:
             raise DesignError("Stage: audited = True needs solid = True")
         if self.most_iterations is not None:
@@ -164,6 +167,9 @@ class Settings:
         if not self.stages or not all(isinstance(stage, Stage) for stage in self.stages):
             raise DesignError(f"Settings: stages = {self.stages!r} must be Stages, at least one")
         object.__setattr__(self, "stages", tuple(self.stages))
+        for name in ("adapt_move_limit", "sharpen_asymptotes", "best_first"):
+            value = flag("Settings", name, getattr(self, name), error=DesignError)
+            object.__setattr__(self, name, value)
         for name in ("window", "least_iterations", "most_iterations", "most_failures"):
             object.__setattr__(
                 self, name, count("Settings", name, getattr(self, name), 1, error=DesignError)

@@ -31,13 +31,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 import mpmopt
-from mpmopt.errors import RunFileError
+from mpmopt.errors import RunFileError, StorageError
 from mpmopt.files import replace_file
 from mpmopt.history import Candidate, Iteration, Leg, Optimisation, StageState
 from mpmopt.optimize import Settings
 from mpmopt.problem import Problem, Variables
 from mpmopt.scene import Scene
-from mpmopt.seals import refusing, sealed, unsealed
+from mpmopt.seals import LARGEST, SEAL, refusing, sealed, unsealed
 
 FORMAT, VERSION = "mpmopt run", 3
 WHOLE = tuple(f.name for f in dataclasses.fields(Iteration) if f.type == "int")
@@ -152,7 +152,7 @@ def write(
     Raises
     ------
     StorageError
-        If the file cannot be written; an older one is still whole.
+        If the file cannot be written, or would be too large to be read; an older one is still whole.
     """
     # HDF5 does not survive a write that fails, so it writes to memory only.
     with h5py.File(f"run-{uuid4()}", "w", driver="core", backing_store=False) as file:
@@ -162,6 +162,11 @@ def write(
             file.create_dataset(f"drawing/{coarsening}", data=there, dtype="?")
         file.flush()
         image = file.id.get_file_image()
+    if len(image) + SEAL > LARGEST:
+        raise StorageError(
+            f"{path} would have {len(image):.3g} bytes, more than {LARGEST:.0e}, which nothing "
+            "reads back; take fewer stages or starts, or fewer particles"
+        )
     replace_file(Path(path), sealed(image))
 
 

@@ -355,6 +355,7 @@ def test_a_stage_that_never_runs_gives_up_after_three_halvings(scene, start, mon
         {"leave_out": -0.1},
         {"leave_out": 1.0},
         {"audited": True},
+        {"solid": "no"},
         {"most_iterations": 0},
     ],
 )
@@ -373,6 +374,7 @@ def test_senseless_stages_are_refused(wrong):
         {"window": 0},
         {"least_iterations": 300},
         {"tolerance": -1.0},
+        {"best_first": "false"},
         {"most_failures": 0},
     ],
 )

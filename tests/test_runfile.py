@@ -212,6 +212,16 @@ def test_a_file_that_is_far_too_large_is_not_read(path):
         runfile.read(path)
 
 
+def test_a_file_that_would_be_too_large_to_be_read_is_not_written(run, path, monkeypatch):
+    before = path.read_bytes()
+    monkeypatch.setattr(runfile, "LARGEST", len(before))
+    runfile.write(path, run)
+    monkeypatch.setattr(runfile, "LARGEST", len(before) - 1)
+    with pytest.raises(StorageError, match="nothing reads back"):
+        runfile.write(path, run)
+    assert path.read_bytes() == before
+
+
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.9, 0.999])
 def test_a_truncated_run_file_is_refused(path, share):
     data = path.read_bytes()
