@@ -152,7 +152,7 @@ def write(
     Raises
     ------
     StorageError
-        If the file cannot be written, or would be too large to be read; an older one is still whole.
+        If the file cannot be written, or nothing would read it back; an older one is still whole.
     """
     # HDF5 does not survive a write that fails, so it writes to memory only.
     with h5py.File(f"run-{uuid4()}", "w", driver="core", backing_store=False) as file:

@@ -66,7 +66,7 @@ def test_what_a_step_gains_is_what_the_actuators_give():
 
 
 def margin(simulation):
-    return simulation.watch()[1].energy
+    return simulation.watch().margins.energy
 
 
 @pytest.mark.parametrize("precision", ["double", "single"])
@@ -108,7 +108,7 @@ def test_the_balance_is_the_same_for_every_schedule_and_for_complex_numbers():
     problem, x = lively()
     simulation = problem.simulation(x)
     simulation.initial[2] += 3.0 * simulation.initial[1]  # it shears: not zero to begin with
-    expected = simulation.watch()[1]
+    expected = simulation.watch().margins
     for every in (1, 7, 100, "all"):
         with simulation.checkpoints(Checkpointing(every=every)) as checkpoints:
             assert simulation.forward(checkpoints).margins == expected

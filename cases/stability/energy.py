@@ -135,7 +135,7 @@ def balance(kind: str, case: str) -> dict[str, Any]:
     row: dict[str, Any] = {"kind": kind, "case": case, "courant": np.nan, "spin": np.nan,
                            "energy": np.nan, "error": ""}  # fmt: skip
     try:
-        margins = make().watch()[1]
+        margins = make().watch().margins
         return row | {key: getattr(margins, key) for key in ("courant", "spin", "energy")}
     except SimulationError as error:
         return row | {"error": error.what}
