@@ -33,14 +33,14 @@ def plot(path: Path, out: Path | None, force: bool) -> int:
     """Write pictures of a run: its scene, its bodies in motion, its history."""
     from mpmopt import runfile
     from mpmopt.files import make_folder, refuse_foreign
-    from mpmopt.plot import pictures, plot_run
+    from mpmopt.plot import picture_files, plot_run
     from mpmopt.progress import Progress
 
     run = runfile.read(path)
     folder = out or path.parent
-    make_folder(folder)
-    files = pictures(folder)
+    files = picture_files(folder).values()
     refuse_foreign(files, force)
+    make_folder(folder)
     with Progress("pictures", len(files)) as progress:
 
         def written(picture: Path) -> None:
@@ -61,8 +61,8 @@ def film(path: Path, out: Path | None, mp4: bool, seconds: float | None, force: 
         raise DesignError(f"--mp4 does not write {out}: leave --mp4 out, or let FILE end in .mp4")
     run = runfile.read(path)
     target = out or path.parent / ("film.mp4" if mp4 else "film.gif")
-    make_folder(target.parent)
     refuse_foreign([target], force)
+    make_folder(target.parent)
     print(f"{target}: {filmed(target, run, seconds)}")
     return 0
 
@@ -190,11 +190,10 @@ def export(path: Path, out: Path | None, force: bool, **options: Any) -> int:
     from mpmopt import runfile
     from mpmopt.export import FILES, size
     from mpmopt.export import export as exported
-    from mpmopt.files import make_folder, refuse_foreign
+    from mpmopt.files import refuse_foreign
 
     run = runfile.read(path)
     folder = out or path.parent
-    make_folder(folder)
     refuse_foreign((folder / FILES[name] for name in options["formats"]), force)
     done = exported(run.problem(), run.best, folder, **options)
     for file in done.paths:

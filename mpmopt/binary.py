@@ -79,7 +79,7 @@ def distance(scene: Scene, keep: NDArray[np.bool_], variables: Variables) -> flo
     simulation, objective = solid_body(scene, keep, variables)
     end = simulation.watch()
     refuse_nonsense(end.margins, simulation, WHOLE)
-    return float(objective.value(end.state, end.before))
+    return float(objective.value(end.state, end.settled))
 
 
 def kept(problem: Problem, x: NDArray, threshold: float = THRESHOLD) -> NDArray[np.bool_]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import logging
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -186,7 +187,8 @@ def run(
     MpmoptError
         As `optimise` does.
     """
-    path = (out / "run.h5").resolve()
+    path = Path(os.path.realpath(out / "run.h5"))
+    out = path.parent
     first = case.settings.stages[0]
     problem = Problem(first.scene(case.scene), first.beta)
     turns = QUARTER_TURNS if case.settings.scouting else (0.0,)
@@ -232,7 +234,7 @@ def resume(path: Path, checkpointing: Checkpointing | None = None) -> dict[str, 
     MpmoptError
         As `optimise` does.
     """
-    path = path.resolve()  # a link would be replaced instead of what it leads to
+    path = Path(os.path.realpath(path))  # a link would be replaced, not what it leads to
     with locked(path):
         return _go_on(path, runfile.read(path), checkpointing)
 

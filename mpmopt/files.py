@@ -16,8 +16,8 @@ from mpmopt.errors import StorageError
 
 logger = logging.getLogger(__name__)
 
-MARK = "made by mpmopt"  # in the metadata of pictures and films, within their first bytes
-HEAD = 10_000
+# In the metadata of pictures and films, which are within so many bytes (of MP4, after its tables).
+MARK, HEAD = "made by mpmopt", 1_000_000
 
 
 def replace_file(path: Path, content: bytes) -> None:
@@ -46,7 +46,7 @@ def replace_file(path: Path, content: bytes) -> None:
 
 
 def refuse_foreign(paths: Iterable[Path], force: bool = False) -> None:
-    """Refuse to replace files that others made: all that have no `MARK`.
+    """Refuse to replace files that others made, or may have worked on: all without a `MARK`.
 
     Raises
     ------

@@ -54,10 +54,9 @@ def interruptible(advice: Callable[[], str]) -> Iterator[None]:
     heard: list[int] = []
 
     def raise_it(number: int, frame: FrameType | None) -> None:
-        for each in SIGNALS:  # a second one shall not spoil what the first one ends
-            signal.signal(each, signal.SIG_IGN)
-        heard.append(number)
-        raise Interrupted(number)
+        if not heard:  # a second one shall not spoil what the first one ends
+            heard.append(number)
+            raise Interrupted(number)
 
     reader, writer = os.pipe()
     os.set_blocking(writer, False)
@@ -114,24 +113,23 @@ def reported(work: Callable[[], int | None], advice: Callable[[], str]) -> int:
     try:
         with interruptible(advice):
             code = work() or 0
-            if sys.stdout is not None:
-                sys.stdout.flush()
+            print(end="", flush=True)  # what has no reader fails here
             return code
-    except (EOFError, UnpicklingError) as error:  # only Numba reads such files
+    except (EOFError, UnpicklingError) as error:
         say(
-            f"{type(error).__name__}: {error}: the compiled kernels that Numba kept are damaged; "
-            "remove its *.nbi files, in __pycache__ of the package, ~/.cache/numba or "
+            f"{type(error).__name__}: {error}: probably the compiled kernels that Numba kept are "
+            "damaged; remove its *.nbi files, in __pycache__ of the package, ~/.cache/numba or "
             "NUMBA_CACHE_DIR"
         )
         return 1
     except (MpmoptError, OSError, MemoryError) as error:
         say(f"{type(error).__name__}: {error}")
-        if sys.stdout is not None:
-            _abandon(sys.stdout)
         return 1
     except Interrupted as interrupted:
         say(f"\n{interrupted}. {advice()}")
         return interrupted.code
+    finally:
+        _close(sys.stdout)
 
 
 def say(line: str) -> None:
@@ -141,8 +139,10 @@ def say(line: str) -> None:
             print(line, file=sys.stderr, flush=True)
 
 
-def _abandon(stream: TextIO) -> None:
-    """Let nothing more be written to a stream that is broken, not even at exit."""
+def _close(stream: TextIO | None) -> None:
+    """Write what a stream still holds, or, if it is broken, let nothing more go there."""
+    if stream is None:
+        return
     try:
         stream.flush()
     except OSError:
@@ -151,7 +151,7 @@ def _abandon(stream: TextIO) -> None:
 
 def how_to_go_on(path: Path) -> str:
     """Advice to someone whose run was interrupted."""
-    if not path.exists():
+    if not os.access(path, os.F_OK):
         return "Nothing was computed yet; the same command begins anew."
     command = shlex.join(["python", "-m", "mpmopt", "resume", str(path)])
     return f"Every evaluation is saved; go on with: {command}"

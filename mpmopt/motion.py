@@ -124,11 +124,11 @@ class Motion:
         wanted = sorted({*map(int, frames), transient})
         found = dict(zip(wanted, simulation.run(wanted)))
         states = np.array([found[int(frame)] for frame in frames])
-        before = found[transient] if transient else None
+        settled = found[transient] if transient else None
         objective = Objective.of(simulation.particles, scene.direction)
         actuator = simulation.particles.actuator
         counted = (found[max(int(frame), transient)] for frame in frames)
-        values = [float(objective.value(state, before)) for state in counted]
+        values = [float(objective.value(state, settled)) for state in counted]
         if scene.mirror is not None:
             states = np.array([with_image(state, scene.mirror) for state in states])
             gamma, actuator = np.tile(gamma, 2), np.tile(actuator, 2)

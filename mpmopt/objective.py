@@ -15,8 +15,8 @@ from mpmopt.particles import Particles
 class Objective:
     """Where the centroid c = sum_p V_p J_p x_p.e / sum_p V_p J_p of a body ends.
 
-    The sums are over solid and actuator particles. L is c at the end (paper, sec. 2.4); after a
-    transient it is c(end) - c(transient) + c(start), as if the body had stayed where it was.
+    The sums are over solid and actuator particles. L is c at the end (paper, sec. 2.4). With a
+    transient, L = start + c(end) - c(settled), as if the body had stayed where it was till then.
 
     Attributes
     ----------
@@ -39,23 +39,23 @@ class Objective:
         along = particles.position @ np.array(direction)
         return cls(np.array(direction), weight, float(weight @ along / weight.sum()))
 
-    def value(self, state: NDArray, before: NDArray | None = None) -> Any:
+    def value(self, state: NDArray, settled: NDArray | None = None) -> Any:
         """L of a final state and, if there is one, of that after the transient.
 
         Parameters
         ----------
-        state, before : (12, N) arrays
+        state, settled : (12, N) arrays
             Real or complex.
         """
-        if before is not None:
-            return self.value(state) - (self.value(before) - self.start)
+        if settled is not None:
+            return self.value(state) - (self.value(settled) - self.start)
         volume = self.weight * (state[8] * state[11] - state[9] * state[10])
         return volume @ (self.direction @ state[0:2]) / volume.sum()
 
     def seed(self, state: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Derivative of c by a state (12, N): where the reverse loop starts.
+        """Derivative of c with respect to a state (12, N): where the reverse loop starts.
 
-        L depends on the state after the transient by minus this.
+        That of L with respect to the state after the transient is minus this.
         """
         volume = self.weight * (state[8] * state[11] - state[9] * state[10])
         along = self.direction @ state[0:2]

@@ -27,8 +27,6 @@ from mpmopt.schematic import schematic
 
 logger = logging.getLogger(__name__)
 
-PICTURES = ("schematic", "history", "design", "post_processed", "reference")
-
 
 def plot_motion(path: Path, body: Body, pictures: int = 8) -> None:
     """Write a PNG of a body at equal intervals from start to end.
@@ -91,9 +89,18 @@ def overview(run: Optimisation) -> Figure:
     return figure
 
 
-def pictures(folder: Path) -> list[Path]:
-    """The files that `plot_run` writes to a folder."""
-    return [folder / f"{name}.png" for name in PICTURES]
+PICTURES: dict[str, Callable[[Path, RunFile], None]] = {
+    "schematic": lambda path, run: replace_file(path, png(schematic(run.scene))),
+    "history": lambda path, run: plot_history(path, run.run),
+    "design": lambda path, run: plot_motion(path, optimised(run.problem(), run.best)),
+    "post_processed": lambda path, run: plot_motion(path, post_processed(run.problem(), run.best)),
+    "reference": lambda path, run: plot_motion(path, reference(run.problem(), run.best)),
+}
+
+
+def picture_files(folder: Path) -> dict[str, Path]:
+    """The files that `plot_run` writes to a folder, by name."""
+    return {name: folder / f"{name}.png" for name in PICTURES}
 
 
 def plot_run(folder: Path, run: RunFile, progress: Callable[[Path], None] | None = None) -> None:
@@ -117,18 +124,10 @@ def plot_run(folder: Path, run: RunFile, progress: Callable[[Path], None] | None
     StorageError
         If a file cannot be written.
     """
-    problem, x = run.problem(), run.best
-    draws: dict[str, Callable[[Path], None]] = {
-        "schematic": lambda path: replace_file(path, png(schematic(run.scene))),
-        "history": lambda path: plot_history(path, run.run),
-        "design": lambda path: plot_motion(path, optimised(problem, x)),
-        "post_processed": lambda path: plot_motion(path, post_processed(problem, x)),
-        "reference": lambda path: plot_motion(path, reference(problem, x)),
-    }
-    for path in pictures(folder):
-        draw = draws[path.stem]
+    run.candidate()  # an error before anything is written
+    for name, path in picture_files(folder).items():
         try:
-            draw(path)
+            PICTURES[name](path, run)
         except SimulationError as error:
             logger.warning("no %s: %s", path.name, error)
             continue

@@ -273,7 +273,7 @@ class Problem:
         simulation = self.simulation(x)
         end = simulation.watch()
         self._check(end.margins, simulation)
-        value = _finite(self.objective(simulation).value(end.state, end.before), simulation)
+        value = _finite(self.objective(simulation).value(end.state, end.settled), simulation)
         return Evaluation(value, np.empty(0), end.margins, self.scene.time_step)
 
     def _value_and_gradient(self, x: NDArray[np.float64]) -> Evaluation:
@@ -295,10 +295,10 @@ class Problem:
             forward = simulation.forward(checkpoints, memory)
             self._check(forward.margins, simulation)
             objective = self.objective(simulation)
-            state, before = forward.state, forward.before
-            value = float(_finite(objective.value(state, before), simulation))
+            state, settled = forward.state, forward.settled
+            value = float(_finite(objective.value(state, settled), simulation))
             gradient = forward.reverse(
-                objective.seed(state), None if before is None else -objective.seed(before)
+                objective.seed(state), None if settled is None else -objective.seed(settled)
             )
         bars = np.zeros((3, len(self.particles.position)))
         bars[:, self.present(phi)] = gradient.density, gradient.lame_lambda, gradient.lame_mu

@@ -295,7 +295,7 @@ class Scene(_Checked):
         a matter of the step. Zero is the affine transfer, as in the paper: they keep nothing.
     transient : float, optional
         Time at the start in which travel does not count, so that a body which tips over once gains
-        nothing by it. Zero, as in the paper: all of it counts.
+        nothing by it, rounded to whole steps. Zero, as in the paper: all of it counts.
 
     Raises
     ------
@@ -373,8 +373,8 @@ class Scene(_Checked):
             )
         if not self.transient_steps < self.steps:
             raise SceneError(
-                f"Scene: transient = {self.transient:g} leaves nothing of the duration "
-                f"{self.duration:g}; take more steps"
+                f"Scene: transient = {self.transient:g} takes all of the {self.steps} steps; take "
+                "more of them"
             )
         self._check_body()
         self._check_size()
@@ -399,7 +399,7 @@ class Scene(_Checked):
             f"Scene of {nx} x {ny} cells {self.grid.dx:g} wide, {self.steps} steps of "
             f"{self.time_step:g}: a body of regions {body}{mirror}; "
             f"free where {walls or 'the grid is'}; gravity ({gx:g}, {gy:g}); to travel along "
-            f"({ex:g}, {ey:g}){f' after {self.transient:g}' if self.transient else ''}"
+            f"({ex:g}, {ey:g}){f' after {self.transient:g}' if self.transient_steps else ''}"
         )
 
     def _repr_png_(self) -> bytes:

@@ -263,7 +263,7 @@ class Simulation:
             watcher.follow(memory.states, first, last)
             memory.states[0] = memory.states[last - first]
         state = mpm.ungrouped(memory.states[0], *self.initial.shape)
-        return Watched(state, watcher.before, watcher.margins)
+        return Watched(state, watcher.settled, watcher.margins)
 
     def margins(self, records: NDArray) -> Margins:
         """Those of a state, as records of groups of particles (`mpm.grouped`), but for energy."""
@@ -372,13 +372,13 @@ class Watched(NamedTuple):
     ----------
     state : (12, N) array
         The final state.
-    before : (12, N) array or None
+    settled : (12, N) array or None
         The state after the scene's transient, if it has one.
     margins : Margins
     """
 
     state: NDArray
-    before: NDArray | None
+    settled: NDArray | None
     margins: Margins
 
 
@@ -387,7 +387,7 @@ class _Watcher:
 
     def __init__(self, simulation: Simulation) -> None:
         self.simulation, self._seen = simulation, Margins()
-        self.before: NDArray | None = None
+        self.settled: NDArray | None = None
         self._balance = Balance(simulation.body, simulation.world, simulation.signal)
 
     def follow(self, states: NDArray, first: int, last: int) -> None:
@@ -396,7 +396,7 @@ class _Watcher:
         transient = self.simulation.scene.transient_steps
         if first < transient <= last:
             shape = self.simulation.initial.shape
-            self.before = mpm.ungrouped(states[transient - first], *shape)
+            self.settled = mpm.ungrouped(states[transient - first], *shape)
         slots = [*range(-first % WATCH, last - first, WATCH)]
         if last == self.simulation.steps:
             slots.append(last - first)
@@ -547,7 +547,7 @@ class Forward:
     ----------
     state : (12, N) array
         The final state.
-    before : (12, N) array or None
+    settled : (12, N) array or None
         The state after the scene's transient, if it has one.
     margins : Margins
     """
@@ -559,7 +559,7 @@ class Forward:
         memory: _Segment,
         watcher: _Watcher,
     ) -> None:
-        self.before, self.margins = watcher.before, watcher.margins
+        self.settled, self.margins = watcher.settled, watcher.margins
         self._simulation, self._checkpoints, self._memory = simulation, checkpoints, memory
         self._reversed = False
         first, last = checkpoints.schedule.segments[-1]
@@ -574,7 +574,7 @@ class Forward:
         return len(schedule.segments) - 1
 
     def reverse(
-        self, seed: NDArray[np.float64], before: NDArray[np.float64] | None = None
+        self, seed: NDArray[np.float64], transient_seed: NDArray[np.float64] | None = None
     ) -> Gradient:
         """Go back through all steps from the objective's derivatives by states.
 
@@ -582,7 +582,7 @@ class Forward:
         ----------
         seed : (12, N) array
             By the final state.
-        before : (12, N) array, optional
+        transient_seed : (12, N) array, optional
             By the state after the scene's transient.
 
         Raises
@@ -631,8 +631,8 @@ class Forward:
                     part_bar,
                 )
                 stop = start
-                if before is not None and first + start == transient:
-                    bar += mpm.grouped(before.astype(dtype), repeat=False)
+                if transient_seed is not None and first + start == transient:
+                    bar += mpm.grouped(transient_seed.astype(dtype), repeat=False)
             signal_bar[first:last] = part_bar.sum(axis=0)
         return Gradient(
             density=simulation.particles.volume * mpm.ungrouped(body_bar.mass, 1, count)[0],

@@ -157,6 +157,21 @@ def test_foreign_files_are_overwritten_only_by_force(tmp_path):
     assert run(TINY, tmp_path, force=True)["evaluations"] == 2
 
 
+def test_a_linked_run_is_written_where_the_link_leads(tmp_path):
+    there, here = tmp_path / "there", tmp_path / "here"
+    there.mkdir()
+    here.mkdir()
+    (here / "run.h5").symlink_to(there / "run.h5")
+    (there / "design.png").write_text("somebody's")
+    with pytest.raises(StorageError, match=r"there/design\.png is there already"):
+        run(TINY, here)
+    (there / "design.png").unlink()
+    assert run(TINY, here) == resume(here / "run.h5")
+    assert [path.name for path in here.iterdir()] == ["run.h5"]
+    assert len(list(there.iterdir())) == 4
+    assert (here / "run.h5").is_symlink()
+
+
 def test_a_folder_that_cannot_be_made_is_a_storage_error(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(StorageError, match="cannot write to"):

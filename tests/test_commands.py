@@ -166,6 +166,26 @@ def test_a_reader_that_goes_away_is_an_error_in_a_line(short_path):
     assert (done.returncode, done.stderr) == (1, "BrokenPipeError: [Errno 32] Broken pipe\n")
 
 
+STOPPED = """
+import os, signal, sys
+from mpmopt.interrupt import reported
+def work():
+    print("half a line", end="")
+    os.kill(os.getpid(), signal.SIGINT)
+sys.exit(reported(work, lambda: "Advice."))
+"""
+
+
+def test_a_signal_counts_even_if_nobody_reads(tmp_path):
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(
+            [sys.executable, "-c", STOPPED],
+            stdout=full, stderr=subprocess.PIPE, text=True, timeout=120, cwd=ROOT,
+            env={name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"},
+        )  # fmt: skip
+    assert (done.returncode, done.stderr) == (130, "\nstopped by SIGINT. Advice.\n")
+
+
 def test_nobody_needs_to_listen_to_progress(short_path, tmp_path):
     film = tmp_path / "film.gif"
     command = f"{sys.executable} -m mpmopt film {short_path} --seconds 0.4 --out {film}"

@@ -24,7 +24,8 @@ from mpmopt.errors import (
     SimulationError,
     StorageError,
 )
-from mpmopt.film import LAST, RATE, Screen, film, playing_time
+from mpmopt.files import refuse_foreign
+from mpmopt.film import LAST, RATE, Screen, _mp4, film, playing_time
 from mpmopt.interrupt import Interrupted
 from mpmopt.motion import Motion, equal_steps, optimised, post_processed, reference
 from mpmopt.problem import Problem
@@ -142,6 +143,13 @@ def test_mp4_has_the_frames_of_the_gif(short_run, tmp_path):
     screen = Screen(motions(short_run, 10), 0.4 / 0.16)
     for number in (0, 5, 9):
         assert np.abs(frames[number].astype(int) - screen.frame(number)).mean() <= 4.0
+
+
+def test_a_long_film_is_known_as_ours(tmp_path):
+    grey = np.zeros((16, 16, 3), np.uint8)
+    file = tmp_path / "film.mp4"
+    file.write_bytes(_mp4(grey for _ in range(2000)))
+    refuse_foreign([file])
 
 
 def test_mp4_without_its_library_says_what_to_install(short_run, tmp_path, monkeypatch):

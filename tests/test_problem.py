@@ -62,6 +62,9 @@ def test_after_a_transient_only_what_follows_counts_and_the_gradient_is_exact(fi
     assert value == part.value(x) == pytest.approx(end - before + start, abs=1e-15)
     assert abs(value - whole.value(x)) > 1e-5
     assert worst(complex_step_test(part, x)) <= COMPLEX_TOLERANCE
+    assert part.at(scene.time_step / 2.0).value(x) == pytest.approx(value, abs=1e-2)
+    single = Problem(part.scene, 2.0, precision="single").value_and_gradient(x)[1]
+    assert np.linalg.norm(single - gradient) <= 1e-4 * np.linalg.norm(gradient)
     for every in (1, 7, 10, "all"):
         other = Problem(part.scene, 2.0, Checkpointing(every, store="memory"))
         assert np.array_equal(other.value_and_gradient(x)[1], gradient)

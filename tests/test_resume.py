@@ -153,7 +153,8 @@ def test_a_signal_ends_going_on_too_and_says_how_to_go_on(whole, tmp_path):
     before = file.stat().st_mtime_ns
     command = [sys.executable, "-m", "mpmopt", "resume", str(file)]
     going_on = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
-    while file.stat().st_mtime_ns == before and going_on.poll() is None:
+    until = time.monotonic() + 50.0
+    while file.stat().st_mtime_ns == before and time.monotonic() < until:
         time.sleep(0.01)
     going_on.send_signal(signal.SIGTERM)
     _, text = going_on.communicate(timeout=50)

@@ -112,7 +112,7 @@ def main() -> None:
             "transient forgotten",
             simulate.Forward,
             "reverse",
-            lambda self, seed, before, reverse=simulate.Forward.reverse: reverse(self, seed),
+            lambda self, seed, *_, reverse=simulate.Forward.reverse: reverse(self, seed),
         ),
         (
             "volume in the objective",
