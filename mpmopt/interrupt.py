@@ -72,6 +72,13 @@ def interruptible(advice: Callable[[], str]) -> Iterator[None]:
         say(f"\n{interrupted}. {advice()}")
         os._exit(interrupted.code)
 
+    complain = sys.unraisablehook
+
+    def swallowed(what: sys.UnraisableHookArgs) -> None:
+        if not isinstance(what.exc_value, Interrupted):
+            complain(what)
+
+    sys.unraisablehook = swallowed
     handlers = {number: signal.signal(number, raise_it) for number in SIGNALS}
     before = signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
     watcher = threading.Thread(target=watch, daemon=True)
@@ -79,12 +86,13 @@ def interruptible(advice: Callable[[], str]) -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        # A callback of a compiler may swallow what is raised in it, and leave an error of its own.
+        # A compiler swallows what is raised in its callbacks, and stumbles over what they left out.
         if heard:
             raise Interrupted(heard[0]) from error
         raise
     finally:
         over.set()
+        sys.unraisablehook = complain
         signal.set_wakeup_fd(before)
         for number, handler in handlers.items():
             signal.signal(number, handler)
