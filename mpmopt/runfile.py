@@ -248,8 +248,8 @@ def read(path: Path) -> RunFile:
     with refusing(path, "run file", RunFileError):
         if not path.is_file():
             raise RunFileError(f"{path} is not there; give the path of a run.h5")
-    with refusing(path, "run file", RunFileError), unsealed(path, "run file") as file:
-        return _read(file, path)
+        with unsealed(path, "run file") as file:
+            return _read(file, path)
 
 
 def _read(file: h5py.File, path: Path) -> RunFile:

@@ -7,7 +7,6 @@ place of the real one.
 import json
 import sys
 import types
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -86,8 +85,7 @@ def verdicts(scene, x) -> dict[str, bool]:
 
 
 def main() -> None:
-    scene = small_scene(particles_per_cell=1, steps=8, blend_time=5e-3)
-    scene = replace(scene, transient=3 * scene.time_step)
+    scene = small_scene(particles_per_cell=1, steps=8, blend_time=5e-3, transient=3 * 4e-3)
     p = Problem(scene)
     rng = np.random.default_rng(0)
     x = p.join(rng.uniform(-0.5, 0.5, 8), [0.6, 0.5], [-0.3, 0.2], [-0.5, 0.4])
