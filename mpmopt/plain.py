@@ -1,7 +1,7 @@
 """One step as its equations say it, node by node: the slow definition of what `mpmopt.mpm` does.
 
 The kernels sum over nodes by polynomials of cells, in groups of four particles and blocks of them.
-Tests hold them against this.
+Tests hold them against this, which shares no arithmetic with them.
 """
 
 from __future__ import annotations
@@ -9,7 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from mpmopt import mpm
+from mpmopt.mpm import ungrouped
+from mpmopt.scene import Scene
 from mpmopt.simulate import Simulation
 
 
@@ -28,10 +29,10 @@ def step(simulation: Simulation, state: NDArray, n: int) -> NDArray:
     -------
     (12, N) array
     """
-    world, body, count = simulation.world, simulation.body, state.shape[1]
-    dt, dx = world.dt, world.dx
+    scene, body, count = simulation.scene, simulation.body, state.shape[1]
+    dt, dx = scene.time_step, scene.grid.dx
     constants = (body.volume, body.mass, body.lame_lambda, body.lame_mu)
-    V, m, la, mu = (mpm.ungrouped(values, 1, count)[0] for values in constants)
+    V, m, la, mu = (ungrouped(values, 1, count)[0] for values in constants)
     x, v = state[0:2], state[2:4]
     C, F = state[4:8].reshape(2, 2, count), state[8:12].reshape(2, 2, count)
     I = np.eye(2)[:, :, None]  # noqa: E741
@@ -42,22 +43,22 @@ def step(simulation: Simulation, state: NDArray, n: int) -> NDArray:
 
     # stress
     sS = np.zeros_like(F)
-    for k, (xx, xy, yy) in enumerate(body.actuation_stress):
-        there = mpm.ungrouped(body.actuated[k], 1, count)[0]
-        sS = sS + simulation.signal[n, k] * there * np.array([[[xx], [xy]], [[xy], [yy]]])
+    for k, actuator in enumerate(scene.actuators):
+        there = simulation.particles.actuator == k
+        sS = sS + simulation.signal[n, k] * there * np.array(actuator.stress)[:, :, None]
     FT = F.transpose(1, 0, 2)
     tau = mu * (product(F, FT) - I) + la * np.log(J) * I + product(product(F, sS), FT)
     A = m * C - dt * V * (4.0 / dx**2) * tau
 
     # particle to grid
     base = np.floor(x.real / dx - 0.5).astype(int)
-    w = [mpm.weights(x[k] / dx - base[k]) for k in (0, 1)]
     stencil = []
     for a in range(3):
         for b in range(3):
             i, j = base[0] + a, base[1] + b
-            stencil.append((i, j, w[0][a] * w[1][b], np.stack([i, j]) * dx - x))
-    nodes = (world.nodes_x, world.nodes_y)
+            d = np.stack([i, j]) * dx - x
+            stencil.append((i, j, spline(d[0] / dx) * spline(d[1] / dx), d))
+    nodes = tuple(cells + 1 for cells in scene.grid.cells)
     mass = np.zeros(nodes, state.dtype)
     q, q_old = np.zeros((2, *nodes), state.dtype), np.zeros((2, *nodes), state.dtype)
     for i, j, w_i, d in stencil:
@@ -69,9 +70,8 @@ def step(simulation: Simulation, state: NDArray, n: int) -> NDArray:
     # grid update
     u, u_old = np.zeros_like(q), np.zeros_like(q)
     for i, j in zip(*np.nonzero(mass.real > 0.0)):
-        ux = q[0, i, j] / mass[i, j] + dt * world.gravity_x
-        uy = q[1, i, j] / mass[i, j] + dt * world.gravity_y
-        u[:, i, j] = mpm.wall(i, j, ux, uy, world)
+        u[:, i, j] = q[:, i, j] / mass[i, j] + dt * np.array(scene.gravity)
+        meet_walls(scene, np.array([i, j]) * dx, u[:, i, j])
         u_old[:, i, j] = q_old[:, i, j] / mass[i, j]
 
     # grid to particle, and blend
@@ -82,9 +82,37 @@ def step(simulation: Simulation, state: NDArray, n: int) -> NDArray:
         new[4:8] += (4.0 / dx**2) * np.concatenate([w_i * u[k, i, j] * d for k in (0, 1)])
         lost = lost - w_i * u_old[:, i, j]
     new[0:2] = x + dt * new[2:4]
-    new[2:4] += world.keep * lost
+    if scene.blend_time > 0.0:
+        new[2:4] += np.exp(-dt / scene.blend_time) * lost
     new[8:12] = F.reshape(4, count)
     return new
+
+
+def spline(r: NDArray) -> NDArray:
+    """Quadratic B-spline at distances r, in cells, from its middle."""
+    r = np.where(r.real < 0.0, -r, r)
+    return np.where(r.real < 0.5, 0.75 - r**2, np.where(r.real < 1.5, 0.5 * (1.5 - r) ** 2, 0.0))
+
+
+def meet_walls(scene: Scene, place: NDArray[np.float64], u: NDArray) -> None:
+    """Change the velocity u (2,) of a node at a place (2,) where it approaches a wall before it.
+
+    Coulomb: the wall takes the normal velocity, and of the tangential one no more than the friction
+    coefficient times as much.
+    """
+    for wall in scene.walls:
+        normal = "xy".index(wall.axis)
+        outward = 1.0 if wall.solid_side == "below" else -1.0
+        depth = outward * (wall.position - place[normal])
+        approach = -outward * u[normal]
+        if depth > 1e-3 * scene.grid.dx and approach.real > 0.0:
+            sliding = u[1 - normal]
+            speed = sliding if sliding.real > 0.0 else -sliding
+            left = 0.0 * speed
+            if wall.friction != "stick" and speed.real > wall.friction * approach.real:
+                left = speed - wall.friction * approach
+            u[1 - normal] = left if sliding.real > 0.0 else -left
+            u[normal] = 0.0
 
 
 def product(a: NDArray, b: NDArray) -> NDArray:
