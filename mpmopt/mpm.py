@@ -95,6 +95,7 @@ class World(NamedTuple):
 
     dt: float
     dx: float
+    per_dx: float  # 1 / dx, of which cells are found
     nodes_x: int
     nodes_y: int
     gravity_x: float
@@ -367,9 +368,11 @@ def interpolation(position, dx, rows):
     """Nodes and weights (N, 9) of particles at (N, 2); node (i, j) has number i * rows + j."""
     nodes = np.empty((position.shape[0], 9), np.int64)
     values = np.empty((position.shape[0], 9))
+    per_dx = 1.0 / dx
     for p in range(position.shape[0]):
-        i, j = int(position[p, 0] / dx - 0.5), int(position[p, 1] / dx - 0.5)
-        wx, wy = weights(position[p, 0] / dx - i), weights(position[p, 1] / dx - j)
+        x, y = position[p, 0], position[p, 1]
+        i, j = int(cell_coordinate(x, per_dx)), int(cell_coordinate(y, per_dx))
+        wx, wy = weights(per_dx * x - i), weights(per_dx * y - j)
         for a in range(3):
             for b in range(3):
                 nodes[p, 3 * a + b] = (i + a) * rows + j + b
@@ -380,15 +383,15 @@ def interpolation(position, dx, rows):
 @jit
 def find_window(state, world, first, last):
     """Window (i0, j0, ni, nj) of the nodes that particles touch; whether all are on the grid."""
-    dx, per_dx = world.dx, 1.0 / world.dx
-    lo, hi_x, hi_y = 0.5 * dx, (world.nodes_x - 1.5) * dx, (world.nodes_y - 1.5) * dx
+    per_dx, end_x, end_y = world.per_dx, world.nodes_x - 2.0, world.nodes_y - 2.0
     i_max = j_max = real(nothing(state))
     i_min, j_min = i_max + world.nodes_x, j_max + world.nodes_y
     for g in range(first, last):
-        x, y = real(load(state, 12 * g)), real(load(state, 12 * g + 1))
-        if not (within(x, lo, hi_x) and within(y, lo, hi_y)):
+        x = cell_coordinate(real(load(state, 12 * g)), per_dx)
+        y = cell_coordinate(real(load(state, 12 * g + 1)), per_dx)
+        if not (within(x, 0.0, end_x) and within(y, 0.0, end_y)):
             return 0, 0, 0, 0, False
-        i, j = whole(per_dx * x - 0.5), whole(per_dx * y - 0.5)  # as in `locate`
+        i, j = whole(x), whole(y)
         i_min, i_max = least(i_min, i), greatest(i_max, i)
         j_min, j_max = least(j_min, j), greatest(j_max, j)
     i0, i1, j0, j1 = i_min[0], i_max[0], j_min[0], j_max[0]
@@ -434,13 +437,14 @@ def margins(state, body, world, solid, first, last):
 def locate(state, world, part, tile, first, last):
     """The cells of the particles in the window `part` and their places in them, into the tile."""
     i0, j0, _, nj = part
-    per_dx = 1.0 / world.dx
+    per_dx = world.per_dx
     for g in range(first, last):
         k = g - first
-        x, y = per_dx * load(state, 12 * g), per_dx * load(state, 12 * g + 1)
-        i, j = whole(real(x) - 0.5), whole(real(y) - 0.5)
+        x, y = load(state, 12 * g), load(state, 12 * g + 1)
+        i = whole(cell_coordinate(real(x), per_dx))
+        j = whole(cell_coordinate(real(y), per_dx))
         store(tile.cell, k, (nj - 2) * (i - i0) + (j - j0))
-        tx, ty = x - (i + 1.0), y - (j + 1.0)
+        tx, ty = per_dx * x - (i + 1.0), per_dx * y - (j + 1.0)
         hx, hy = 0.5 * tx * tx, 0.5 * ty * ty
         store(tile.place, 6 * k, tx)
         store(tile.place, 6 * k + 1, ty)
@@ -654,7 +658,7 @@ def p2g(state, body, tile, cells, first, last):
 @jit
 def p2g_adjoint(state, body, world, tile, cells, bar, body_bar, first, last):
     """From momentum_bar and mass_bar of cells to A_bar; adds to x_bar, v_bar and mass_bar."""
-    dx, per_dx, gathered = world.dx, 1.0 / world.dx, tile.gathered
+    dx, per_dx, gathered = world.dx, world.per_dx, tile.gathered
     for g in range(first, last):
         t = g - first
         for k in range(4):
@@ -714,17 +718,12 @@ def wall(i, j, u, v, world):
     `friction` times as much of its tangential velocity.
     """
     for k in range(world.wall_axis.size):
-        side = world.wall_side[k]
         normal_is_x = world.wall_axis[k] == 0
-        if side * (world.wall_node[k] - (i if normal_is_x else j)) > 0:
+        if is_behind(i, j, k, world):
             un, ut = (u, v) if normal_is_x else (v, u)
-            if side * un.real < 0.0:
-                friction = world.wall_friction[k]
-                if abs(ut.real) <= friction * abs(un.real):
-                    ut = 0.0 * ut
-                else:
-                    ut = ut + np.sign(ut.real) * friction * side * un
-                un = 0.0 * un
+            if world.wall_side[k] * un.real < 0.0:
+                keep, slope = friction(un.real, ut.real, k, world)
+                un, ut = 0.0 * un, fused(slope, un, keep * ut)
             u, v = (un, ut) if normal_is_x else (ut, un)
     return u, v
 
@@ -734,19 +733,12 @@ def wall_adjoint(i, j, u, v, world, u_bar, v_bar):
     """Transpose of `wall`: through the derivative D of its branches, of (u, v) by (u, v)."""
     d00, d01, d10, d11 = 1.0, 0.0, 0.0, 1.0
     for k in range(world.wall_axis.size):
-        side = world.wall_side[k]
         normal_is_x = world.wall_axis[k] == 0
-        if side * (world.wall_node[k] - (i if normal_is_x else j)) > 0:
+        if is_behind(i, j, k, world):
             un, ut = (u, v) if normal_is_x else (v, u)
-            if side * un < 0.0:
-                friction = world.wall_friction[k]
-                keep, slope = 1.0, 0.0
-                if abs(ut) <= friction * abs(un):
-                    keep = 0.0
-                else:
-                    slope = np.sign(ut) * friction * side
-                ut = keep * ut + slope * un
-                un = 0.0
+            if world.wall_side[k] * un < 0.0:
+                keep, slope = friction(un, ut, k, world)
+                un, ut = 0.0, fused(slope, un, keep * ut)
                 if normal_is_x:
                     d10, d11 = keep * d10 + slope * d00, keep * d11 + slope * d01
                     d00 = d01 = 0.0
@@ -755,6 +747,22 @@ def wall_adjoint(i, j, u, v, world, u_bar, v_bar):
                     d10 = d11 = 0.0
             u, v = (un, ut) if normal_is_x else (ut, un)
     return d00 * u_bar + d10 * v_bar, d01 * u_bar + d11 * v_bar
+
+
+@jit
+def is_behind(i, j, k, world):
+    """Whether node (i, j) is strictly behind wall k."""
+    node = i if world.wall_axis[k] == 0 else j
+    return world.wall_side[k] * (world.wall_node[k] - node) > 0
+
+
+@jit
+def friction(un, ut, k, world):
+    """What an approaching node's tangential velocity becomes at wall k: keep ut + slope un."""
+    coefficient = world.wall_friction[k]
+    if abs(ut) <= coefficient * abs(un):
+        return 0.0, 0.0
+    return 1.0, np.sign(ut) * coefficient * world.wall_side[k]
 
 
 @jit
@@ -772,6 +780,15 @@ def add_blocks(parts, sheet, windows, window, a, nodes):
 
 
 @jit
+def free_velocity(grid, node, per_m, world):
+    """Velocity of a node from momentum, 1 / mass and gravity, before the walls."""
+    return (
+        fused(grid[0, node, 0], per_m, world.dt * world.gravity_x),
+        fused(grid[0, node, 1], per_m, world.dt * world.gravity_y),
+    )
+
+
+@jit
 def grid_update(grid, window, world, velocity, a):
     """Velocity of column a's nodes from momentum, gravity and walls; zero where no mass is."""
     i0, j0, _, nj = window
@@ -780,9 +797,7 @@ def grid_update(grid, window, world, velocity, a):
         m = grid[0, node, 2]
         u = v = 0.0 * m
         if m.real > world.dust:
-            per_m = 1.0 / m
-            u = grid[0, node, 0] * per_m + world.dt * world.gravity_x
-            v = grid[0, node, 1] * per_m + world.dt * world.gravity_y
+            u, v = free_velocity(grid, node, 1.0 / m, world)
             u, v = wall(i0 + a, j0 + b, u, v, world)
         velocity[0, 2 * node], velocity[0, 2 * node + 1] = u, v
         if world.keep > 0.0:
@@ -806,8 +821,7 @@ def grid_update_adjoint(grid, window, world, velocity_bar, node_bar, a):
             u_bar, v_bar = wall_adjoint(
                 i0 + a,
                 j0 + b,
-                u + world.dt * world.gravity_x,
-                v + world.dt * world.gravity_y,
+                *free_velocity(grid, node, per_m, world),
                 world,
                 velocity_bar[0, 2 * node],
                 velocity_bar[0, 2 * node + 1],
@@ -827,7 +841,7 @@ def momentum_bar(node_bar, node, u, v, per_m, u_bar, v_bar):
     """Adjoint of a velocity (u, v) = q / m, into a node's record."""
     node_bar[node, 0] = u_bar * per_m
     node_bar[node, 1] = v_bar * per_m
-    node_bar[node, 2] = -(u_bar * u + v_bar * v) * per_m
+    node_bar[node, 2] = -fused(v_bar, v, u_bar * u) * per_m
 
 
 @jit
@@ -856,7 +870,7 @@ def g2p_adjoint(world, tile, cells, cells_bar, bar, first, last):
 
     Without a blend v_bar and C_bar are zero here: what follows adds to them.
     """
-    dt, per_dx = world.dt, 1.0 / world.dx
+    dt, per_dx = world.dt, world.per_dx
     c, h = 4.0 * per_dx, tile.gathered
     for g in range(first, last):
         t = g - first
@@ -898,7 +912,7 @@ def blend_adjoint(world, tile, cells, cells_bar, bar, first, last):
 
     After `g2p_adjoint`, which leaves keep v_bar' as v_bar.
     """
-    per_dx = 1.0 / world.dx
+    per_dx = world.per_dx
     for g in range(first, last):
         t = g - first
         for k in range(4):
@@ -1107,11 +1121,11 @@ def first_inverted(state, first, last):
 @jit
 def first_outside(state, world, first, last):
     """The first particle of groups of four that is off the grid, or is not a number."""
-    lo = 0.5 * world.dx
-    hi_x, hi_y = (world.nodes_x - 1.5) * world.dx, (world.nodes_y - 1.5) * world.dx
+    per_dx, end_x, end_y = world.per_dx, world.nodes_x - 2.0, world.nodes_y - 2.0
     for p in range(4 * first, 4 * last):
-        x, y = state[12 * (p // 4), p % 4].real, state[12 * (p // 4) + 1, p % 4].real
-        if not (lo <= x < hi_x and lo <= y < hi_y):
+        x = cell_coordinate(state[12 * (p // 4), p % 4].real, per_dx)
+        y = cell_coordinate(state[12 * (p // 4) + 1, p % 4].real, per_dx)
+        if not (0.0 <= x < end_x and 0.0 <= y < end_y):
             return p
     return -1
 
@@ -1191,6 +1205,20 @@ def logarithm(x):
     """The natural logarithms of a record of positive numbers."""
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.log(x)
+
+
+def cell_coordinate(x, per_dx):
+    """A coordinate in cells from the middle of the first one; its whole part is the first node.
+
+    What decides, here and in `fused`, is rounded alike wherever it stands, forward and adjoint: no
+    compiler may contract it into what is around it.
+    """
+    return per_dx * x - 0.5
+
+
+def fused(a, b, c):
+    """Number a b + c, whose real part is rounded once."""
+    return a * b + c
 
 
 def meet(meeting, threads):
@@ -1439,6 +1467,30 @@ def _whole(typingctx, x):
 
 
 @intrinsic
+def _cell_coordinate(typingctx, x, per_dx):
+    def generate(context, builder, signature, arguments):
+        kind = arguments[0].type
+        half = ir.Constant(kind, x.lanes * [0.5] if isinstance(x, Register) else 0.5)
+        per_dx_ = arguments[1] if per_dx == x else context.cast(builder, arguments[1], per_dx, x)
+        # Having a flag, these get none of the options', which would let them be contracted.
+        cells = builder.fmul(arguments[0], per_dx_, flags=("nsz",))
+        return builder.fsub(cells, half, flags=("nsz",))
+
+    return x(x, per_dx), generate
+
+
+@intrinsic
+def _fused(typingctx, a, b, c):
+    kind = types.float64 if types.float64 in (a, b, c) else a
+
+    def generate(context, builder, signature, arguments):
+        numbers = zip(arguments, signature.args, strict=True)
+        return builder.fma(*(context.cast(builder, value, of, kind) for value, of in numbers))
+
+    return kind(a, b, c), generate
+
+
+@intrinsic
 def _within(typingctx, x, low, high):
     def generate(context, builder, signature, arguments):
         above = builder.fcmp_ordered("<=", arguments[1], arguments[0])
@@ -1647,6 +1699,20 @@ def _overload_real(x):
 @overload(whole)
 def _overload_whole(x):
     return lambda x: _whole(x)
+
+
+@overload(cell_coordinate)
+def _overload_cell_coordinate(x, per_dx):
+    if isinstance(x, Register):
+        return lambda x, per_dx: _cell_coordinate(x, _as(per_dx, x))
+    return lambda x, per_dx: _cell_coordinate(x, per_dx)
+
+
+@overload(fused)
+def _overload_fused(a, b, c):
+    if types.complex128 in (a, b, c):
+        return lambda a, b, c: complex(_fused(a.real, b.real, c.real), (a * b + c).imag)
+    return lambda a, b, c: _fused(a, b, c)
 
 
 @overload(within)

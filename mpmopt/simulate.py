@@ -18,7 +18,7 @@ from mpmopt.checks import shown
 from mpmopt.energy import Balance
 from mpmopt.errors import DesignError, SimulationError, StorageError
 from mpmopt.particles import Particles
-from mpmopt.scene import MOST_NUMBERS, ROUNDING, Scene
+from mpmopt.scene import MOST_NUMBERS, Scene
 from mpmopt.threads import together
 
 Precision = Literal["double", "single"]
@@ -42,16 +42,10 @@ def check_precision(precision: Precision) -> Precision:
 def world_of(scene: Scene) -> mpm.World:
     """The scene's surroundings as the kernels see them."""
     dx = scene.grid.dx
-    nodes = []
-    for wall in scene.walls:
-        # The first node that is not strictly behind the wall.
-        if wall.solid_side == "below":
-            nodes.append(math.ceil(wall.position / dx - ROUNDING))
-        else:
-            nodes.append(math.floor(wall.position / dx + ROUNDING))
     return mpm.World(
         dt=scene.time_step,
         dx=dx,
+        per_dx=1.0 / dx,
         nodes_x=scene.grid.cells[0] + 1,
         nodes_y=scene.grid.cells[1] + 1,
         gravity_x=scene.gravity[0],
@@ -60,7 +54,7 @@ def world_of(scene: Scene) -> mpm.World:
         wall_side=np.array(
             [1 if w.solid_side == "below" else -1 for w in scene.walls], dtype=np.int64
         ),
-        wall_node=np.array(nodes, dtype=np.int64),
+        wall_node=np.array([round(w.position / dx) for w in scene.walls], dtype=np.int64),
         wall_friction=np.array(
             [np.inf if w.friction == "stick" else w.friction for w in scene.walls], dtype=float
         ),

@@ -33,7 +33,7 @@ FAULTS = {
         "gathered, 9 * t + 1, k, along_x[1])",
     ),
     "mass in the momentum": ("+ u * u_bar + v * v_bar)", ")"),
-    "mass of a node": ("-(u_bar * u + v_bar * v) * per_m", "-(u_bar * u + v_bar * v)"),
+    "mass of a node": ("-fused(v_bar, v, u_bar * u) * per_m", "-fused(v_bar, v, u_bar * u)"),
     "step in the velocity": ("v_bar + dt * load(bar, 12 * g + axis)", "v_bar"),
     "what the blend keeps": (
         "store(bar, 12 * g + 2 + axis, world.keep * v_bar)",
