@@ -12,8 +12,9 @@ from mpmopt.mpm import interpolation
 from mpmopt.particles import Particles, lay_out, mirror_images
 from mpmopt.scene import Material, Scene
 
-# Weights below this are left out of a filter of many passes.
-NEGLIGIBLE = 1e-8
+# Nodes with less than this of a particle's weight do not carry it. Lattice sites have none or far
+# more, but for rounding of their position.
+LEAST_WEIGHT = 1e-12
 
 
 def filter_matrix(
@@ -38,15 +39,15 @@ def filter_matrix(
     body = lay_out(scene, whole=True)
     position = body.position[body.designed]
     nodes, values = interpolation(position, scene.grid.dx, rows)
-    carries = values > 0.0
+    carries = values > LEAST_WEIGHT
     used, column = np.unique(nodes[carries], return_inverse=True)
     to_particles = scipy.sparse.csr_array(
         (values[carries], (np.nonzero(carries)[0], column)), shape=(len(position), used.size)
     )
 
     w0, w1, w2 = scene.filter_weights
-    i, j = np.divmod(used, rows)
-    i, j = (index - min(index, default=0) for index in (i, j))
+    node = np.stack(np.divmod(used, rows), axis=1)
+    i, j = (index - min(index, default=0) for index in node.T)
     number = np.full(
         (max(i, default=0) + 3, max(j, default=0) + 3), -1
     )  # with a margin of empty nodes
@@ -66,14 +67,19 @@ def filter_matrix(
         return scipy.sparse.diags_array(1.0 / matrix.sum(axis=1)) @ matrix
 
     matrix, convolution = normalised(to_particles.T.tocsr()), normalised(convolution)
+    # Distances on the lattice, in half spacings, are whole numbers, which no rounding changes.
+    halves = 2 * scene.particles_per_cell
+    site = np.rint(position * (halves / scene.grid.dx)).astype(np.int64)
     for _ in range(scene.filter_passes):
         matrix = (convolution @ matrix).tocsr()
-        matrix.data[matrix.data < NEGLIGIBLE] = 0.0
+        row = np.repeat(np.arange(used.size), np.diff(matrix.indptr))
+        apart = halves * node[row] - site[matrix.indices]
+        matrix.data[(apart**2).sum(axis=1) > (halves * scene.filter_radius) ** 2] = 0.0
         matrix.eliminate_zeros()
     half, whole = particles.subset(particles.designed), body.subset(body.designed)
     points = half.position if points is None else points
     nodes, values = interpolation(points, scene.grid.dx, rows)
-    row, k = np.nonzero((values > 0.0) & np.isin(nodes, used))
+    row, k = np.nonzero((values > LEAST_WEIGHT) & np.isin(nodes, used))
     to_points = scipy.sparse.csr_array(
         (values[row, k], (row, np.searchsorted(used, nodes[row, k]))), (len(points), used.size)
     )
@@ -127,9 +133,14 @@ class DesignChain:
         self._designed = particles.designed
         self._material = scene.material
 
+    def filtered(self, phi: NDArray) -> NDArray:
+        """Filtered phi (D,). Rounding takes it beyond [-1, 1] by nothing."""
+        filtered = self.filter @ phi
+        return filtered - (filtered.real - np.clip(filtered.real, -1.0, 1.0))
+
     def gamma(self, phi: NDArray) -> NDArray:
-        """Material density (D,) of the design particles, within [0, 1] but for rounding."""
-        return project(self.filter @ phi, self.beta)
+        """Material density (D,) of the design particles, within [0, 1]."""
+        return project(self.filtered(phi), self.beta)
 
     def material(self, phi: NDArray) -> tuple[NDArray, NDArray, NDArray]:
         """rho, lambda and mu of all particles, (N,) each."""
@@ -142,7 +153,7 @@ class DesignChain:
     ) -> NDArray:
         """phi_bar (D,) from the adjoints of rho, lambda and mu, (N,) each."""
         gamma_bar = interpolate_adjoint(self._material, density_bar, lambda_bar, mu_bar)
-        phi_bar = project_adjoint(self.filter @ phi, self.beta, gamma_bar[self._designed])
+        phi_bar = project_adjoint(self.filtered(phi), self.beta, gamma_bar[self._designed])
         return self.filter.T @ phi_bar
 
 

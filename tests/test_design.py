@@ -18,6 +18,7 @@ from mpmopt.design import (
 )
 from mpmopt.errors import DesignError
 from mpmopt.particles import lay_out
+from mpmopt.problem import Problem
 from mpmopt.scene import Design, Grid, Material, Scene, Solid
 
 
@@ -89,6 +90,38 @@ def test_filter_does_not_wrap_round_the_edge_of_the_grid(rng):
     matrix = filter_matrix(scene, lay_out(scene))
     phi = rng.uniform(-1.0, 1.0, matrix.shape[1])
     assert matrix @ phi == pytest.approx(literal_filter(scene, phi), abs=1e-14)
+
+
+@pytest.mark.parametrize("per_cell", [1, 2, 3])
+@pytest.mark.parametrize("length", [0.0, 2.0, 3.0])
+def test_the_filter_does_not_depend_on_the_unit_of_length(rng, per_cell, length):
+    # Lattice sites, edges and halves of cells are where they are but for rounding.
+    phi, gamma = rng.uniform(-1.0, 1.0, 24 * per_cell**2), []
+    for dx in (1 / 64, 1 / 22, 1 / 7, 0.1, 7.0):
+        scene = Scene(
+            Grid((20, 20), dx), 1e-4 * dx, 1, filter_length=length * dx,
+            particles_per_cell=per_cell,
+            body=(
+                Design((4 * dx, 4 * dx), (10 * dx, 8 * dx)),
+                Solid((4 * dx, 8 * dx), (10 * dx, 9 * dx)),
+            ),
+        )  # fmt: skip
+        gamma.append(DesignChain(scene, lay_out(scene), 8.0).gamma(phi))
+    assert np.ptp(gamma, axis=0).max() <= 1e-14
+
+
+@pytest.mark.parametrize("beta", [1.0, 7.0, 32.0])
+@pytest.mark.parametrize("end", [-1.0, 1.0])
+def test_no_particle_is_more_than_solid_or_less_than_void(beta, end):
+    # Weights sum to one but for rounding, which must take no particle beyond its bounds.
+    c = 1 / 16
+    body = (Design((4 * c, 4 * c), (8 * c, 8 * c)), Solid((4 * c, 8 * c), (8 * c, 9 * c)))
+    problem = Problem(Scene(Grid((16, 16), c), 1e-3, 1, body), beta)
+    x = problem.join(end, *3 * [np.empty(0)])
+    gamma = problem.gamma(x)
+    assert 0.0 <= gamma.min() <= gamma.max() <= 1.0
+    assert gamma == pytest.approx(float(end > 0.0), abs=1e-14)
+    assert problem.present(problem.split(x).phi).all()
 
 
 @pytest.mark.parametrize("length", [1 / 64, 1 / 80])
