@@ -189,7 +189,7 @@ class Actuator(Region):
 
 @dataclass(frozen=True)
 class Wall(_Checked):
-    """Axis-parallel rigid wall: nodes strictly behind it are clamped while they approach it.
+    """Axis-parallel rigid wall on a line of nodes: those behind are clamped while they approach it.
 
     Bodies touch it when their kernels do, with a softness of about a cell; the lowest particles of
     a resting body lie about at `position`.
@@ -199,7 +199,7 @@ class Wall(_Checked):
     axis : {"x", "y"}
         Axis of the wall's normal: a floor has "y".
     position : float
-        Coordinate of the wall on that axis.
+        Coordinate of the wall on that axis; on a line of nodes.
     solid_side : {"below", "above"}
         Side of `position` that is solid, towards smaller or larger coordinates.
     friction : float or "stick"
@@ -488,6 +488,12 @@ class Scene(_Checked):
                     f"Scene: wall at {wall.axis} = {wall.position:g} must be within [{dx:g}, "
                     f"{size - dx:g}], so that there are nodes behind it"
                 )
+            line = round(wall.position / dx)
+            if abs(wall.position / dx - line) > ROUNDING:
+                raise SceneError(
+                    f"Scene: wall at {wall.axis} = {wall.position:.10g} is on no line of nodes, of "
+                    f"which it clamps those behind it; the nearest is at {line * dx:.10g}"
+                )
             for region in self.body:
                 depth = (
                     wall.position - region.lower[k]
@@ -621,16 +627,24 @@ class Scene(_Checked):
         """
         _, w1, w2 = self.filter_weights
         cells = self.filter_length / self.grid.dx
-        return max(1, round((cells**2 - 0.5) / (2.0 * (w1 + 2.0 * w2))))
+        passes = (cells**2 - 0.5) / (2.0 * (w1 + 2.0 * w2))
+        # Halfway between two numbers, rounding does not choose: it is the upper one.
+        return max(1, math.floor(passes + 0.5 + ROUNDING))
+
+    @property
+    def filter_radius(self) -> float:
+        """Distance, in cells, beyond which the filter takes no notice of a particle.
+
+        Six standard deviations of its passes and three cells more.
+        """
+        _, w1, w2 = self.filter_weights
+        spread = math.sqrt(2.0 * self.filter_passes * (w1 + 2.0 * w2))
+        return min(self.filter_passes, 6.0 * spread) + 3.0
 
     @property
     def filter_neighbours(self) -> int:
         """Particles from which the filter takes at most, where all around are designed."""
-        # Weights further away than six standard deviations are left out (`design.NEGLIGIBLE`).
-        _, w1, w2 = self.filter_weights
-        spread = math.sqrt(2.0 * self.filter_passes * (w1 + 2.0 * w2))
-        reach = 2 * math.ceil(min(self.filter_passes, 6.0 * spread) + 3)
-        return (reach * self.particles_per_cell) ** 2
+        return (2 * math.ceil(self.filter_radius) * self.particles_per_cell) ** 2
 
     def vary(
         self,

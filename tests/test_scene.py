@@ -112,6 +112,10 @@ C = 1 / 16
         (lambda: small_scene(walls=(Wall("y", 5 * C),)), ["0.0625 into the wall", "0.3125"]),
         (lambda: small_scene(walls=(Wall("y", 1.5),)), ["1.5", "within [0.0625, 0.9375]"]),
         (lambda: small_scene(walls=(Wall("y", 0.0),)), ["y = 0 ", "nodes behind it"]),
+        (
+            lambda: small_scene(walls=(Wall("y", 2.25 * C),)),
+            ["no line of nodes", "nearest", "0.125"],
+        ),
         (lambda: small_scene(steps=10**30), ["from 1 to 1e+08"]),
         (lambda: small_scene().vary(time_step=1e-20), ["more than 1e+08 steps"]),
         (lambda: small_scene(time_step=0.1), ["0.1", "0.00988", "stability"]),
