@@ -10,7 +10,8 @@ import numpy as np
 from mpmopt.errors import MpmoptError, SceneError
 
 MOST = 10**8  # of anything that is counted
-# Sizes of numbers that a scene may hold, so that products of several are finite and not zero.
+# Sizes of numbers that a scene may hold, so that products of several are finite and not zero:
+# limits of what floats represent, in whatever units, which decide nothing between them.
 TINY, HUGE = 1e-30, 1e30
 
 

@@ -138,7 +138,8 @@ class Settings:
     window : int
         Iterations in the moving average of the stop rule.
     tolerance : float
-        A stage ends when the moving average changes by no more than this.
+        A stage ends when the moving average changes by no more than this share of the grid's
+        longer side.
     least_iterations, most_iterations : int
         Successful evaluations of a stage.
     most_failures : int
@@ -351,6 +352,8 @@ class _StageRun:
         self.whole, self.run, self.leg = whole, whole.run, leg
         settings = self.run.settings
         self.stage = settings.stages[leg.stage]
+        # All lengths are taken in these, so that no unit decides anything.
+        self.width = max(self.run.scene.grid.size)
         state = self.run.stage_state
         self._pose(state.time_step if state else None)
         self.mma = MovingAsymptotes(
@@ -417,11 +420,17 @@ class _StageRun:
         if self.failures and self.farthest is not None:
             mma.reset()
             mma.move_limit /= 2.0
-            return mma.step(self.farthest.x, -self.farthest.objective, -self.farthest_gradient)
+            return self._move(self.farthest.x, self.farthest.objective, self.farthest_gradient)
         went_back = len(self.values) > 1 and self.values[-1] < self.values[-2]
         factor = SHORTEN if went_back and self.run.settings.adapt_move_limit else LENGTHEN
         mma.move_limit = min(self.stage.move_limit, factor * mma.move_limit)
-        return mma.step(x, -self.values[-1], -self.gradient)
+        return self._move(x, self.values[-1], self.gradient)
+
+    def _move(
+        self, x: NDArray[np.float64], value: float, gradient: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """The step of the moving asymptotes from x."""
+        return self.mma.step(x, -value / self.width, -gradient / self.width)
 
     def _best_before(self) -> NDArray[np.float64] | None:
         """The best design of the stage before, on this stage's grid."""
@@ -536,12 +545,13 @@ class _StageRun:
         values, count, window = self.values, len(self.values), settings.window
         if count >= max(settings.least_iterations, window + 1):
             change = abs(np.mean(values[-window:]) - np.mean(values[-window - 1 : -1]))
-            if change <= settings.tolerance:
+            limit = settings.tolerance * self.width
+            if change <= limit:
                 last = self.run.history[-1]
                 return (
                     f"the mean objective over {window} iterations changed by {change:.1e} <= "
-                    f"{settings.tolerance:.1e} after {count} of them (last step {last.step:.1e} of "
-                    f"the range, projected gradient {last.projected_gradient:.1e})."
+                    f"{limit:.1e} after {count} of them (last step {last.step:.1e} of the range, "
+                    f"projected gradient {last.projected_gradient:.1e})."
                 )
         if count >= (self.stage.most_iterations or settings.most_iterations):
             return f"it reached its limit of {count} iterations."
