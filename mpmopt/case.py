@@ -18,6 +18,7 @@ from mpmopt import binary, runfile
 from mpmopt.audit import audit
 from mpmopt.binary import Drawing, farthest, full_block, pieces, post_processed, unactuated
 from mpmopt.checkpoints import Checkpointing
+from mpmopt.checks import digits
 from mpmopt.errors import DesignError, RunFileError, SimulationError, StorageError
 from mpmopt.files import locked, make_folder, refuse_foreign, replace_file
 from mpmopt.history import Optimisation
@@ -146,7 +147,7 @@ class ProgressBar:
             return
         last = run.history[-1]
         self._progress.step(
-            f"L {last.objective:.4f}, beta {last.beta:g}, greyness {last.greyness:.3f}"
+            f"L {digits(last.objective)}, beta {last.beta:g}, greyness {last.greyness:.3f}"
         )
 
 
@@ -358,7 +359,8 @@ def table(summary: Mapping[str, Any]) -> str:
     width = max(len(name) for name in flat)
     lines = []
     for name, value in flat.items():
-        shown = f"{value:.4f}" if isinstance(value, float) else str(value)
+        values = value if isinstance(value, list) else [value]
+        shown = ", ".join(digits(v) if isinstance(v, float) else str(v) for v in values)
         lines.append(f"{name.replace('_', ' '):<{width}}  {shown}")
     return "\n".join(lines)
 

@@ -24,6 +24,11 @@ def shown(value: Any) -> str:
     return text if len(text) <= 80 else f"{text[:77]}..."
 
 
+def digits(value: float, count: int = 4) -> str:
+    """A number with so many significant digits: of decimals, small units would leave none."""
+    return f"{value:#.{count}g}".removesuffix(".")
+
+
 def number(
     owner: str,
     name: str,
