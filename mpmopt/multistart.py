@@ -210,7 +210,7 @@ def report(rows: Sequence[dict[str, Any]]) -> str:
     columns: dict[str, tuple[str, Callable[[Any], str]]] = {
         "start": ("start", str),
         "post_processed": ("post-processed", _length),
-        "gain": ("gain", _length),
+        "gain": ("     gain", _length),
         "kept_half_step": ("kept at half step", "{:.0%}".format),
         "kept_half_cells": ("at half cells", "{:.0%}".format),
         "audited_gain": ("audited gain", _length),
@@ -218,9 +218,10 @@ def report(rows: Sequence[dict[str, Any]]) -> str:
         "failed_evaluations": ("failed", str),
         "seconds": ("seconds", "{:.0f}".format),
     }
-    cells = [[head, *(form(row[name]) for row in rows)] for name, (head, form) in columns.items()]
-    widths = [max(map(len, column)) for column in cells]
-    lines = ["  ".join(map(str.rjust, line, widths)) for line in zip(*cells)]
+    lines = ["  ".join(heading for heading, _ in columns.values())]
+    for row in rows:
+        cells = (form(row[name]).rjust(len(head)) for name, (head, form) in columns.items())
+        lines.append("  ".join(cells))
     for name in ("gain", "audited_gain"):
         values = [row[name] for row in rows if math.isfinite(row[name])]
         if values:
