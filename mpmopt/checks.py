@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from mpmopt.errors import MpmoptError, SceneError
+from mpmopt.errors import DesignError, MpmoptError, SceneError
 
 MOST = 10**8  # of anything that is counted
 # Sizes of numbers that a scene may hold, so that products of several are finite and not zero:
@@ -79,6 +79,22 @@ def count(
     if not least <= value <= most:
         raise error(f"{owner}: {name} = {shown(value)} must be from {least} to {most:.3g}")
     return int(value)
+
+
+def instance(
+    owner: str,
+    name: str,
+    value: Any,
+    kind: type,
+    hint: str = "",
+    *,
+    error: type[MpmoptError] = DesignError,
+) -> None:
+    """An error that says what to write where a value is of another kind."""
+    if not isinstance(value, kind):
+        raise error(
+            f"{owner}: {name} = {shown(value)} must be a {kind.__name__}{hint and f'; {hint}'}"
+        )
 
 
 def flag(owner: str, name: str, value: Any, *, error: type[MpmoptError] = SceneError) -> bool:

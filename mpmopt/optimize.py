@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from mpmopt import audit
 from mpmopt.binary import post_processed
 from mpmopt.checkpoints import Checkpointing
-from mpmopt.checks import count, flag, number, share
+from mpmopt.checks import count, flag, instance, number, share, shown
 from mpmopt.design import greyness
 from mpmopt.errors import DesignError, SceneError, SimulationError
 from mpmopt.history import Candidate, Iteration, Leg, Optimisation, StageState
@@ -28,6 +28,8 @@ logger = logging.getLogger(__name__)
 
 # Factors on the move limit after a step that went back, and after one that went on.
 SHORTEN, LENGTHEN = 0.6, 1.2
+# Successful evaluations of a stage before the stop rule may end it.
+LEAST = 20
 # How often a stage of which no design runs halves its time step before the run gives up.
 HALVINGS = 3
 
@@ -84,8 +86,9 @@ class Stage:
         for name in ("beta", "mass_floor", "stiffness_floor", "time_step", "move_limit"):
             value = number("Stage", name, getattr(self, name), above=0.0, error=DesignError)
             object.__setattr__(self, name, value)
-        if self.move_limit > 1.0:
-            raise DesignError(f"Stage: move_limit = {self.move_limit} must be at most 1")
+        for name in ("mass_floor", "stiffness_floor", "move_limit"):
+            if getattr(self, name) > 1.0:
+                raise DesignError(f"Stage: {name} = {getattr(self, name)} must be at most 1")
         leave_out = share("Stage", "leave_out", self.leave_out, error=DesignError)
         object.__setattr__(self, "leave_out", leave_out)
         for name in ("solid", "audited"):
@@ -128,6 +131,7 @@ class Settings:
     Attributes
     ----------
     stages : tuple of Stage
+        Or a single one.
     adapt_move_limit : bool
         Shorten the move limit after a step that went back, and lengthen it, up to the stage's,
         after one that went on.
@@ -140,7 +144,10 @@ class Settings:
     tolerance : float
         A stage ends when the moving average changes by no more than this share of the grid's
         longer side.
-    least_iterations, most_iterations : int
+    least_iterations : int, optional
+        Successful evaluations of a stage before the stop rule may end it; default: 20, or
+        `most_iterations` if that is less.
+    most_iterations : int
         Successful evaluations of a stage.
     most_failures : int
         Failed evaluations in a row after which the optimisation gives up.
@@ -159,22 +166,25 @@ class Settings:
     best_first: bool = True
     window: int = 10
     tolerance: float = 2e-4
-    least_iterations: int = 20
+    least_iterations: int | None = None
     most_iterations: int = 200
     most_failures: int = 8
     scouting: int = 0
 
     def __post_init__(self) -> None:
-        if not self.stages or not all(isinstance(stage, Stage) for stage in self.stages):
-            raise DesignError(f"Settings: stages = {self.stages!r} must be Stages, at least one")
-        object.__setattr__(self, "stages", tuple(self.stages))
+        given: Any = self.stages
+        stages = tuple(given) if isinstance(given, Iterable) else (given,)
+        if not stages or not all(isinstance(stage, Stage) for stage in stages):
+            raise DesignError(f"Settings: stages = {shown(given)} must be Stages, at least one")
+        object.__setattr__(self, "stages", stages)
         for name in ("adapt_move_limit", "sharpen_asymptotes", "best_first"):
             value = flag("Settings", name, getattr(self, name), error=DesignError)
             object.__setattr__(self, name, value)
         for name in ("window", "least_iterations", "most_iterations", "most_failures"):
-            object.__setattr__(
-                self, name, count("Settings", name, getattr(self, name), 1, error=DesignError)
-            )
+            given = getattr(self, name)
+            if name != "least_iterations" or given is not None:
+                given = count("Settings", name, given, 1, error=DesignError)
+                object.__setattr__(self, name, given)
         scouting = count("Settings", "scouting", self.scouting, 0, error=DesignError)
         object.__setattr__(self, "scouting", scouting)
         if scouting > len(self.stages):
@@ -183,13 +193,19 @@ class Settings:
             )
         tolerance = number("Settings", "tolerance", self.tolerance, error=DesignError)
         object.__setattr__(self, "tolerance", tolerance)
-        if self.least_iterations > self.most_iterations:
+        if self.least > self.most_iterations:
             raise DesignError(
                 f"Settings: least_iterations = {self.least_iterations} is above "
                 f"most_iterations = {self.most_iterations}"
             )
         if self.tolerance < 0.0:
             raise DesignError(f"Settings: tolerance = {self.tolerance} must not be negative")
+
+    @property
+    def least(self) -> int:
+        """`least_iterations`, or what it is by default."""
+        default = min(LEAST, self.most_iterations)
+        return default if self.least_iterations is None else self.least_iterations
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Settings:
@@ -198,13 +214,14 @@ class Settings:
 
 
 Callback = Callable[[Optimisation], None]
+HOW = "write Settings(stages), or call what makes them, such as sharpened(time_step)"
 
 
 def optimise(
     scene: Scene,
     settings: Settings,
-    start: NDArray[np.float64] | Sequence[NDArray[np.float64]],
-    callbacks: Iterable[Callback] = (),
+    start: NDArray[np.float64] | Sequence[float] | Sequence[NDArray[np.float64]],
+    callbacks: Iterable[Callback] | Callback = (),
     checkpointing: Checkpointing | None = None,
 ) -> Optimisation:
     """Maximise the distance travelled, stage by stage.
@@ -220,16 +237,18 @@ def optimise(
     start : (n,) array, or several
         First design, within [-1, 1], of the first stage's scene (`Problem.join` makes it). Of
         several the best after `Settings.scouting` stages goes on.
-    callbacks : iterable of callable
+    callbacks : iterable of callable, or one
         Called after each evaluation and once at the end.
     checkpointing : Checkpointing, optional
 
     Raises
     ------
     DesignError
-        If `start` does not fit the scene, or there is nothing to design.
+        If `start` does not fit the scene, there is nothing to design, or anything is of another
+        kind.
     SceneError
-        If a stage cannot be simulated; all are checked before the first evaluation.
+        If a stage cannot be simulated, nothing actuates the body, or it is in several pieces; all
+        is checked before the first evaluation.
     StorageError
         If checkpoints cannot be stored.
     """
@@ -239,7 +258,7 @@ def optimise(
 def begin(
     scene: Scene,
     settings: Settings,
-    start: NDArray[np.float64] | Sequence[NDArray[np.float64]],
+    start: NDArray[np.float64] | Sequence[float] | Sequence[NDArray[np.float64]],
 ) -> Optimisation:
     """An optimisation before its first evaluation, for `go_on`; see `optimise`.
 
@@ -248,7 +267,12 @@ def begin(
     DesignError, SceneError
         As `optimise`.
     """
-    starts = [start] if isinstance(start, np.ndarray) else list(start)
+    instance("optimise", "scene", scene, Scene)
+    instance("optimise", "settings", settings, Settings, HOW)
+    several = isinstance(start, Iterable) and not isinstance(start, np.ndarray)
+    starts: list[Any] = list(start) if several else [start]
+    if starts and all(isinstance(value, (int, float, np.number)) for value in starts):
+        starts = [starts]
     scenes = [stage.scene(scene) for stage in settings.stages]
     first = Problem(scenes[0])
     designs = [first.join(*first.split(x)) for x in starts]
@@ -256,12 +280,34 @@ def begin(
         raise DesignError("there is nothing to design: give a Design or an Actuator, and a start")
     if len(designs) > 1 and settings.scouting == 0:
         raise DesignError(f"{len(designs)} starts need Settings.scouting >= 1, the stages of each")
+    _refuse_unfit(scene)
     return Optimisation(scene, settings, [Leg(k, x) for k, x in enumerate(designs)])
+
+
+def _refuse_unfit(scene: Scene) -> None:
+    """Refuse a body that nothing actuates, or of which regions hang on nothing."""
+    if not scene.actuators:
+        raise SceneError("optimise: the body has no Actuator, so it does not go by itself; add one")
+    first, *apart = scene.body
+    held = [first]
+    for region in held:  # which grows
+        held += [other for other in apart if scene.gap(region, other) is None]
+        apart = [other for other in apart if other not in held]
+    if not apart:
+        return
+    gap, region, other = min(
+        ((scene.gap(a, b) or 0.0, a, b) for a in apart for b in held), key=lambda item: item[0]
+    )
+    how = f"ends {gap:.4g} ({gap / scene.grid.dx:.4g} cells) before" if gap else "only touches"
+    raise SceneError(
+        f"optimise: the body is in pieces: {region} {how} {other}{'' if gap else ' at a corner'}; "
+        "let them share an edge, or put a Design or a Solid between them"
+    )
 
 
 def go_on(
     run: Optimisation,
-    callbacks: Iterable[Callback] = (),
+    callbacks: Iterable[Callback] | Callback = (),
     checkpointing: Checkpointing | None = None,
 ) -> Optimisation:
     """Go on with an optimisation from where it stands to its end; see `optimise`.
@@ -274,8 +320,17 @@ def go_on(
     SceneError, StorageError
         As `optimise`.
     DesignError
-        If its legs do not fit its settings.
+        If its legs do not fit its settings, or a callback is none.
     """
+    instance("go_on", "run", run, Optimisation)
+    several = isinstance(callbacks, Iterable) and not callable(callbacks)
+    all_callbacks: list[Any] = list(callbacks) if several else [callbacks]  # type: ignore[arg-type]
+    for callback in all_callbacks:
+        if isinstance(callback, type) or not callable(callback):
+            raise DesignError(
+                f"callback {shown(callback)} must be a function of the run, or an object that is "
+                "called like one, such as ProgressBar()"
+            )
     stages = len(run.settings.stages)
     for index, leg in enumerate(run.legs):
         if leg.start != index or not 0 <= leg.stage <= stages:
@@ -283,7 +338,7 @@ def go_on(
                 f"leg {index} is of start {leg.start}, at stage {leg.stage} of {stages}: the run "
                 "was changed, take a copy of it"
             )
-    climb = _Climb(run, tuple(callbacks), checkpointing)
+    climb = _Climb(run, tuple(all_callbacks), checkpointing)
     if run.stop_reason:
         return run
     scouting = run.settings.scouting if len(run.legs) > 1 else 0
@@ -543,7 +598,7 @@ class _StageRun:
                 return f"it gave up after {self.failures} failed evaluations in a row."
             return ""
         values, count, window = self.values, len(self.values), settings.window
-        if count >= max(settings.least_iterations, window + 1):
+        if count >= max(settings.least, window + 1):
             change = abs(np.mean(values[-window:]) - np.mean(values[-window - 1 : -1]))
             limit = settings.tolerance * self.width
             if change <= limit:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from mpmopt.actuation import signal, signal_adjoint
 from mpmopt.checkpoints import Checkpointing
-from mpmopt.checks import count, share
+from mpmopt.checks import count, instance, share
 from mpmopt.design import DesignChain
 from mpmopt.errors import DesignError, SimulationError, TornError
 from mpmopt.objective import Objective
@@ -108,7 +108,7 @@ class Problem:
     Raises
     ------
     DesignError
-        If beta, `leave_out`, `redo` or `precision` makes no sense.
+        If the scene is none, or beta, `leave_out`, `redo` or `precision` makes no sense.
     """
 
     def __init__(
@@ -120,12 +120,14 @@ class Problem:
         redo: int = 2,
         precision: Precision = "double",
     ) -> None:
+        instance("Problem", "scene", scene, Scene)
+        self.checkpointing = Checkpointing() if checkpointing is None else checkpointing
+        instance("Problem", "checkpointing", self.checkpointing, Checkpointing)
         self.scene = scene
         self.precision: Precision = check_precision(precision)
         self._memories: list[Memory] = []
         self.leave_out = share("Problem", "leave_out", leave_out, error=DesignError)
         self.redo = count("Problem", "redo", redo, 0, error=DesignError)
-        self.checkpointing = checkpointing or Checkpointing()
         self.particles = lay_out(scene)
         self.chain = DesignChain(scene, self.particles, beta)
         self._designed = int(self.particles.designed.sum())

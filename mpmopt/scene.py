@@ -142,6 +142,9 @@ class Region(_Checked):
                 f"{owner}: lower corner {self.lower} must be left of and below upper {self.upper}"
             )
 
+    def __str__(self) -> str:
+        return f"{type(self).__name__} {self.lower} to {self.upper}"
+
 
 @dataclass(frozen=True)
 class Design(Region):
@@ -580,6 +583,14 @@ class Scene(_Checked):
             round(x1 / spacing),
             round(y1 / spacing),
         )
+
+    def gap(self, region: Region, other: Region) -> float | None:
+        """How far two regions are apart; None if they share an edge, which holds them together."""
+        (low, high), (other_low, other_high) = self.lattice(region), self.lattice(other)
+        apart = [max(low[k] - other_high[k], other_low[k] - high[k]) for k in (0, 1)]
+        if max(apart) == 0 and min(apart) < 0:
+            return None
+        return math.hypot(*(max(a, 0) for a in apart)) * self.grid.dx / self.particles_per_cell
 
     @property
     def largest_time_step(self) -> float:
