@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import os
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -93,8 +95,16 @@ def instance(
     """An error that says what to write where a value is of another kind."""
     if not isinstance(value, kind):
         raise error(
-            f"{owner}: {name} = {shown(value)} must be a {kind.__name__}{hint and f'; {hint}'}"
+            f"{owner}: {name} = {shown(value)} must be an object of class {kind.__name__}"
+            f"{hint and f'; {hint}'}"
         )
+
+
+def place(owner: str, name: str, value: Any) -> Path:
+    """`value` as a path, or an error."""
+    if not isinstance(value, (str, os.PathLike)):
+        raise DesignError(f"{owner}: {name} = {shown(value)} must be a path")
+    return Path(value)
 
 
 def flag(owner: str, name: str, value: Any, *, error: type[MpmoptError] = SceneError) -> bool:
