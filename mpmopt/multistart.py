@@ -7,6 +7,7 @@ import dataclasses
 import functools
 import logging
 import math
+import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,8 +17,8 @@ from numpy.typing import NDArray
 
 from mpmopt import runfile
 from mpmopt.binary import Drawing
-from mpmopt.case import RESULTS, Case, run
-from mpmopt.checks import digits
+from mpmopt.case import RESULTS, Case, drawn, run
+from mpmopt.checks import count, digits, instance, place
 from mpmopt.errors import RunFileError, SweepError
 from mpmopt.files import locked, make_folder, refuse_foreign, replace_file
 from mpmopt.optimize import Settings
@@ -109,7 +110,11 @@ def one_start(
 
 
 def multistart(
-    case: Case, out: Path, starts: int, scheduler: str | None = None, force: bool = False
+    case: Case,
+    out: str | os.PathLike[str],
+    starts: int,
+    scheduler: str | None = None,
+    force: bool = False,
 ) -> str:
     """Optimise a case from several starts: its own, and random ones with seeds 1, 2, ...
 
@@ -121,7 +126,7 @@ def multistart(
     Parameters
     ----------
     case : Case
-    out : Path
+    out : str or path
         Folder; on a cluster one that all workers see under this name.
     starts : int
     scheduler : str, optional
@@ -137,12 +142,15 @@ def multistart(
     Raises
     ------
     SweepError
-        If no start came to an end, or the drawing cannot travel to other processes.
+        If no start is asked for or came to an end, or the drawing cannot travel to other processes.
     StorageError
         If the folder cannot be written to or holds foreign files of those names, or another process
         is at work in it.
     """
-    out = Path(out).absolute()
+    instance("multistart", "case", case, Case)
+    starts = count("multistart", "starts", starts, 1, error=SweepError)
+    out = place("multistart", "out", out).absolute()
+    drawn(case)  # a drawing that is none is found now
     make_folder(out)
     table, picture = out / "starts.csv", out / "starts.png"
     if not (out / "starts.h5").exists():
