@@ -247,8 +247,8 @@ def optimise(
         If `start` does not fit the scene, there is nothing to design, or anything is of another
         kind.
     SceneError
-        If a stage cannot be simulated, nothing actuates the body, or it is in several pieces; all
-        is checked before the first evaluation.
+        If a stage cannot be simulated, nothing actuates the body, it is in several pieces, or has
+        one particle per cell; all is checked before the first evaluation.
     StorageError
         If checkpoints cannot be stored.
     """
@@ -285,9 +285,14 @@ def begin(
 
 
 def _refuse_unfit(scene: Scene) -> None:
-    """Refuse a body that nothing actuates, or of which regions hang on nothing."""
+    """Refuse a body that nothing actuates, that any stretch tears, or that is in pieces."""
     if not scene.actuators:
         raise SceneError("optimise: the body has no Actuator, so it does not go by itself; add one")
+    if scene.particles_per_cell == 1:
+        raise SceneError(
+            "optimise: particles_per_cell = 1 leaves a cell without a particle at any stretch, and "
+            "no body that may crack there counts; take 2 or more"
+        )
     first, *apart = scene.body
     held = [first]
     for region in held:  # which grows

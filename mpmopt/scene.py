@@ -283,7 +283,8 @@ class Scene(_Checked):
     direction : (float, float), optional
         Unit vector e of the objective.
     particles_per_cell : int, optional
-        Particles per cell and direction.
+        Particles per cell and direction; `optimise` needs two or more, which bear stretches up to
+        as many.
     filter_weights : (float, float, float), optional
         Weights w0, w1, w2 of the design filter's 3 x 3 convolution: w0 + 4 w1 + 4 w2 = 1.
     filter_length : float, optional

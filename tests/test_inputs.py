@@ -177,13 +177,14 @@ LOOSE = Solid((6 * C, 7.5 * C), (7 * C, 8 * C))
             ["Solid (0.375, 0.46875)", "ends 0.06988 (1.118 cells) before Actuator"],
         ),
         (pieces(DESIGN, Actuator((3 * C, 6.5 * C), (5 * C, 7 * C))), ["0.03125 (0.5 cells)"]),
+        (small_scene(steps=4, particles_per_cell=1), ["particles_per_cell = 1", "2 or more"]),
         (pieces(DESIGN, Solid((3 * C, 6 * C), (5 * C, 7 * C))), ["no Actuator", "add one"]),
     ],
 )
-def test_a_body_in_pieces_or_without_actuator_is_not_optimised(scene, says):
+def test_a_body_that_makes_no_robot_can_be_simulated_but_not_optimised(scene, says):
     problem = Problem(scene)
     x = problem.join(0.0, 0.0, 0.0, 0.0)
-    assert np.isfinite(problem.value(x))  # but it can be simulated
+    assert np.isfinite(problem.value(x))
     with pytest.raises(SceneError) as error:
         optimise(scene, SHORT, x)
     for part in says:
