@@ -10,7 +10,7 @@ from conftest import small_scene
 from mpmopt import __main__ as commands
 from mpmopt import runfile
 from mpmopt.case import ProgressBar, summarise, table
-from mpmopt.multistart import report
+from mpmopt.multistart import random_start, report
 from mpmopt.optimize import Settings, Stage, optimise
 from mpmopt.problem import Problem
 from mpmopt.scene import Actuator, Design, Grid
@@ -67,6 +67,13 @@ def optimised(length=1.0, mass=1.0, time=1.0):
     start = Problem(stages[0].scene(scene)).join(0.0, 1.0, -0.3, -0.5)
     done = optimise(scene, settings, start, [lambda run: designs.append(run.last)])
     return done, designs
+
+
+def test_a_random_start_is_the_same_in_all_units():
+    scene = small_scene(steps=1)
+    position = Problem(scene).particles.position
+    other = random_start(scaled(scene, 2.0**-9, 2.0, 2.0**5), 3)
+    assert np.array_equal(other(2.0**-9 * position), random_start(scene, 3)(position))
 
 
 @pytest.fixture(scope="module")
