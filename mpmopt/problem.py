@@ -154,6 +154,7 @@ class Problem:
         Examples
         --------
         >>> import numpy as np
+        >>> from mpmopt.problem import Problem
         >>> from mpmopt.scene import Actuator, Design, Grid, Scene
         >>> c = 1 / 16
         >>> body = Design((4 * c, 4 * c), (8 * c, 6 * c)), Actuator((4 * c, 6 * c), (8 * c, 7 * c))

@@ -213,7 +213,7 @@ def test_a_picture_as_phi_is_told_where_its_entries_are():
         PROBLEM.join(np.zeros((4, 8)), 0.0, 0.0, 0.0)
     with pytest.raises(DesignError, match=r"b has shape \(3,\), must have \(2,\) or \(\)$"):
         PROBLEM.join(0.0, 0.0, 0.0, [0.0, 0.1, 0.2])
-    found = doctest.DocTestFinder().find(Problem.join, "join", globs={"Problem": Problem})
+    found = doctest.DocTestFinder().find(Problem.join, "join", globs={})
     assert [doctest.DocTestRunner().run(test).failed for test in found] == [0]
     assert found[0].examples
     # What the example says of the order: of each column of the lattice, the lowest first.
