@@ -23,7 +23,7 @@ from mpmopt.errors import DesignError, RunFileError, SimulationError, StorageErr
 from mpmopt.files import locked, make_folder, refuse_foreign, replace_file
 from mpmopt.history import Optimisation
 from mpmopt.interrupt import how_to_go_on, reported, say
-from mpmopt.optimize import HOW, Settings, Stage, begin, go_on
+from mpmopt.optimize import HOW, Settings, Stage, begin, go_on, refuse_unfit
 from mpmopt.particles import lay_out
 from mpmopt.problem import Problem, Variables
 from mpmopt.progress import Progress
@@ -210,6 +210,7 @@ def run(
     plain = case.start if phi is None else {**case.start, "phi": phi(position)}
     parts = Variables.of(problem.join(**plain), len(position))
     starts = [problem.join(*parts._replace(theta=_turned(parts.theta, turn))) for turn in turns]
+    refuse_unfit(case.scene)
     new, drawing = begin(case.scene, case.settings, starts), drawn(case)
     make_folder(folder)
     with locked(path):

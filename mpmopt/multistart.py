@@ -21,7 +21,7 @@ from mpmopt.case import RESULTS, Case, drawn, run
 from mpmopt.checks import count, digits, instance, place
 from mpmopt.errors import RunFileError, SweepError
 from mpmopt.files import locked, make_folder, refuse_foreign, replace_file
-from mpmopt.optimize import Settings
+from mpmopt.optimize import Settings, refuse_unfit
 from mpmopt.scene import Design, Scene
 from mpmopt.sweeps import as_csv, connected, refuse_stuck, sweep
 
@@ -150,7 +150,8 @@ def multistart(
     instance("multistart", "case", case, Case)
     starts = count("multistart", "starts", starts, 1, error=SweepError)
     out = place("multistart", "out", out).absolute()
-    drawn(case)  # a drawing that is none is found now
+    refuse_unfit(case.scene)
+    drawn(case)  # what is wrong with it is told now, not by every start
     make_folder(out)
     table, picture = out / "starts.csv", out / "starts.png"
     if not (out / "starts.h5").exists():

@@ -280,12 +280,17 @@ def begin(
         raise DesignError("there is nothing to design: give a Design or an Actuator, and a start")
     if len(designs) > 1 and settings.scouting == 0:
         raise DesignError(f"{len(designs)} starts need Settings.scouting >= 1, the stages of each")
-    _refuse_unfit(scene)
     return Optimisation(scene, settings, [Leg(k, x) for k, x in enumerate(designs)])
 
 
-def _refuse_unfit(scene: Scene) -> None:
-    """Refuse a body that nothing actuates, that any stretch tears, or that is in pieces."""
+def refuse_unfit(scene: Scene) -> None:
+    """Refuse a body that no optimisation makes a robot of, though it can be simulated.
+
+    Raises
+    ------
+    SceneError
+        If nothing actuates it, any stretch tears it, or it is in several pieces.
+    """
     if not scene.actuators:
         raise SceneError("optimise: the body has no Actuator, so it does not go by itself; add one")
     if scene.particles_per_cell == 1:
@@ -343,6 +348,8 @@ def go_on(
                 f"leg {index} is of start {leg.start}, at stage {leg.stage} of {stages}: the run "
                 "was changed, take a copy of it"
             )
+    if not run.history:
+        refuse_unfit(run.scene)
     climb = _Climb(run, tuple(all_callbacks), checkpointing)
     if run.stop_reason:
         return run

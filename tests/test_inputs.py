@@ -14,7 +14,7 @@ from mpmopt.case import Case, ProgressBar, drawn, resume, run, sharpened, summar
 from mpmopt.checkpoints import Checkpointing
 from mpmopt.errors import DesignError, SceneError, SweepError
 from mpmopt.multistart import multistart
-from mpmopt.optimize import Settings, Stage, begin, go_on, optimise
+from mpmopt.optimize import Settings, Stage, begin, go_on, optimise, refuse_unfit
 from mpmopt.problem import Problem
 from mpmopt.scene import Actuator, Design, Mirror, Scene, Solid
 
@@ -181,14 +181,21 @@ LOOSE = Solid((6 * C, 7.5 * C), (7 * C, 8 * C))
         (pieces(DESIGN, Solid((3 * C, 6 * C), (5 * C, 7 * C))), ["no Actuator", "add one"]),
     ],
 )
-def test_a_body_that_makes_no_robot_can_be_simulated_but_not_optimised(scene, says):
+def test_a_body_that_makes_no_robot_can_be_simulated_but_not_optimised(tmp_path, scene, says):
     problem = Problem(scene)
     x = problem.join(0.0, 0.0, 0.0, 0.0)
     assert np.isfinite(problem.value(x))
-    with pytest.raises(SceneError) as error:
-        optimise(scene, SHORT, x)
-    for part in says:
-        assert part in str(error.value)
+    case = Case(scene, SHORT, full_block)
+    for call in (
+        lambda: optimise(scene, SHORT, x),
+        lambda: run(case, tmp_path),
+        lambda: multistart(case, tmp_path, 1),
+    ):
+        with pytest.raises(SceneError) as error:
+            call()
+        for part in says:
+            assert part in str(error.value)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_body_that_hangs_together_through_others_is_optimised():
@@ -198,14 +205,14 @@ def test_a_body_that_hangs_together_through_others_is_optimised():
         Design((4 * C, 4 * C), (6 * C, 4.5 * C)),
         mirror=None,
     )
-    assert not begin(around, SHORT, Problem(around).join(0.0, 0.0, 0.0, 0.0)).stop_reason
+    refuse_unfit(around)
     halves = pieces(
         Design((3 * C, 6 * C), (5 * C, 7 * C)),
         Actuator((3 * C, 7 * C), (5 * C, 9 * C)),
         Design((3 * C, 9 * C), (5 * C, 10 * C)),
         mirror=Mirror("y", 8 * C),
     )
-    assert not begin(halves, SHORT, Problem(halves).join(0.0, 0.0, 0.0, 0.0)).stop_reason
+    refuse_unfit(halves)
 
 
 def test_a_picture_as_phi_is_told_where_its_entries_are():
