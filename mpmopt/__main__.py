@@ -93,6 +93,7 @@ def postprocess(path: Path, threshold: float) -> int:
 
     from mpmopt import runfile
     from mpmopt.binary import farthest, full_block, kept, pieces, post_processed
+    from mpmopt.checks import digits
 
     run = runfile.read(path)
     problem, x = run.problem(), run.best
@@ -103,10 +104,14 @@ def postprocess(path: Path, threshold: float) -> int:
         problem.scene, full_block, problem.split(x)
     )
     sizes = np.bincount(pieces(problem.scene, keep)[keep])
-    print(f"reference (full block)   {reference:.4f}")
-    print(f"optimised                {optimised:.4f}")
-    print(f"post-processed           {value:.4f}  (gamma >= {threshold:g} solid, the rest removed)")
-    print(f"share of the gain kept   {(value - reference) / (optimised - reference):.1%}")
+    gain = optimised - reference
+    is_one = gain > 1e-12 * max(problem.scene.grid.size)  # more than rounding
+    share = f"{(value - reference) / gain:.1%}" if is_one else "none, there is no gain"
+    solid = f"(gamma >= {threshold:g} solid, the rest removed)"
+    print(f"reference (full block)   {digits(reference)}")
+    print(f"optimised                {digits(optimised)}")
+    print(f"post-processed           {digits(value)}  {solid}")
+    print(f"share of the gain kept   {share}")
     print(f"design particles kept    {keep.sum()} of {keep.size}")
     loose = ", ".join(str(size) for size in sorted(sizes[1:], reverse=True)) or "none"
     print(f"pieces hanging on nothing, particles of each: {loose}")
@@ -120,6 +125,7 @@ def audit(path: Path) -> int:
     from mpmopt import runfile
     from mpmopt.audit import VARIANTS, Audited
     from mpmopt.audit import audit as audited
+    from mpmopt.checks import digits
     from mpmopt.progress import Progress
 
     run = runfile.read(path)
@@ -133,12 +139,12 @@ def audit(path: Path) -> int:
             cells = f"{row.cells[0]} x {row.cells[1]}"
             kept = "" if np.isnan(row.kept) else f"{row.kept:9.0%}"
             progress.print(
-                f"{row.name:<21}  {cells:>9}  {row.time_step:8.2g}  {row.reference:10.4f}  "
-                f"{row.distance:6.4f}  {kept}"
+                f"{row.name:<21}  {cells:>9}  {row.time_step:8.2g}  {digits(row.reference):>10}  "
+                f"{digits(row.distance):>9}  {kept}"
             )
 
         progress.print(
-            f"{'post-processed design':<21}  {'cells':>9}  {'step':>8}  full block  design  "
+            f"{'post-processed design':<21}  {'cells':>9}  {'step':>8}  full block     design  "
             "gain kept"
         )
         audited(run.problem(), run.best, progress=show)

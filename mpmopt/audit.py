@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from mpmopt import binary
 from mpmopt.binary import distance
+from mpmopt.checks import instance
 from mpmopt.errors import SceneError, SimulationError
 from mpmopt.particles import lay_out, nearest_designed
 from mpmopt.problem import Problem
@@ -116,8 +117,9 @@ def audit(
     Raises
     ------
     DesignError
-        If x does not fit.
+        If x does not fit, or the problem is none.
     """
+    instance("audit", "problem", problem, Problem)
     variables = problem.split(x)
     scene = problem.scene
     variants: dict[str, Callable[[], Scene]] = {

@@ -18,7 +18,8 @@ from mpmopt.simulate import Simulation
 
 THRESHOLD = 0.3  # of gamma, as in the paper
 # Stretch over the particles per cell beyond which some cell has none: a body may crack there. An
-# optimiser may pass through (`problem.LIMITS`), but nothing that went so far counts.
+# optimiser may pass through (`problem.LIMITS`), but nothing that went so far counts. What a cut
+# carries depends on this ratio alone, so one particle per cell bears no stretch at all.
 WHOLE = 1.0
 
 Drawing = Callable[[NDArray[np.float64]], NDArray[np.bool_]]

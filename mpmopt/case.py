@@ -18,11 +18,12 @@ from mpmopt import binary, runfile
 from mpmopt.audit import audit
 from mpmopt.binary import Drawing, farthest, full_block, pieces, post_processed, unactuated
 from mpmopt.checkpoints import Checkpointing
+from mpmopt.checks import digits, instance, place, shown
 from mpmopt.errors import DesignError, RunFileError, SimulationError, StorageError
 from mpmopt.files import locked, make_folder, refuse_foreign, replace_file
 from mpmopt.history import Optimisation
 from mpmopt.interrupt import how_to_go_on, reported, say
-from mpmopt.optimize import Settings, Stage, begin, go_on
+from mpmopt.optimize import HOW, Settings, Stage, begin, go_on, refuse_unfit
 from mpmopt.particles import lay_out
 from mpmopt.problem import Problem, Variables
 from mpmopt.progress import Progress
@@ -53,7 +54,7 @@ class Case:
     Raises
     ------
     DesignError
-        If the start has another name in it.
+        If the start has another name in it, or anything is of another kind.
     """
 
     scene: Scene
@@ -62,6 +63,14 @@ class Case:
     start: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        instance("Case", "scene", self.scene, Scene)
+        instance("Case", "settings", self.settings, Settings, HOW)
+        instance("Case", "start", self.start, Mapping)
+        if not callable(self.drawing):
+            raise DesignError(
+                f"Case: drawing = {shown(self.drawing)} must be a function of positions (D, 2), "
+                "such as binary.full_block"
+            )
         if unknown := set(self.start) - set(START):
             raise DesignError(
                 f"Case: start has {', '.join(unknown)}; its names are {', '.join(START)}"
@@ -146,13 +155,13 @@ class ProgressBar:
             return
         last = run.history[-1]
         self._progress.step(
-            f"L {last.objective:.4f}, beta {last.beta:g}, greyness {last.greyness:.3f}"
+            f"L {digits(last.objective)}, beta {last.beta:g}, greyness {last.greyness:.3f}"
         )
 
 
 def run(
     case: Case,
-    out: Path,
+    out: str | os.PathLike[str],
     checkpointing: Checkpointing | None = None,
     force: bool = False,
     phi: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None,
@@ -166,7 +175,7 @@ def run(
     Parameters
     ----------
     case : Case
-    out : Path
+    out : str or path
         Folder, made if it is not there.
     checkpointing : Checkpointing, optional
     force : bool, optional
@@ -181,21 +190,29 @@ def run(
 
     Raises
     ------
+    DesignError
+        If the drawing is none (`drawn`); it is looked at before anything is written.
     StorageError
         If the folder cannot be made, holds another case's run or foreign files of those names, or
         another process is at work in it.
     MpmoptError
         As `optimise` does.
     """
-    path = Path(os.path.realpath(out / "run.h5"))
-    out = path.parent
+    instance("run", "case", case, Case)
+    path = Path(os.path.realpath(place("run", "out", out) / "run.h5"))
+    folder = path.parent
     first = case.settings.stages[0]
-    problem = Problem(first.scene(case.scene), first.beta)
+    problem = Problem(first.scene(case.scene), first.beta, checkpointing)
     turns = QUARTER_TURNS if case.settings.scouting else (0.0,)
     position = problem.particles.position[problem.particles.designed]
+    if phi is not None and not callable(phi):
+        raise DesignError(f"run: phi = {shown(phi)} must be a function of positions (D, 2)")
     plain = case.start if phi is None else {**case.start, "phi": phi(position)}
-    starts = [problem.join(**{**plain, "theta": _turned(case, turn)}) for turn in turns]
-    make_folder(out)
+    parts = Variables.of(problem.join(**plain), len(position))
+    starts = [problem.join(*parts._replace(theta=_turned(parts.theta, turn))) for turn in turns]
+    refuse_unfit(case.scene)
+    new, drawing = begin(case.scene, case.settings, starts), drawn(case)
+    make_folder(folder)
     with locked(path):
         if path.exists() and not force:
             try:
@@ -212,12 +229,14 @@ def run(
                     "--force to replace it"
                 )
             return _go_on(path, kept, checkpointing)
-        refuse_foreign((out / name for name in RESULTS), force)
-        runfile.write(path, begin(case.scene, case.settings, starts), drawing=drawn(case))
+        refuse_foreign((folder / name for name in RESULTS), force)
+        runfile.write(path, new, drawing=drawing)
         return _go_on(path, runfile.read(path), checkpointing)
 
 
-def resume(path: Path, checkpointing: Checkpointing | None = None) -> dict[str, Any]:
+def resume(
+    path: str | os.PathLike[str], checkpointing: Checkpointing | None = None
+) -> dict[str, Any]:
     """Go on with the run of a run file to the end that it would have had without a stop.
 
     Returns
@@ -234,17 +253,34 @@ def resume(path: Path, checkpointing: Checkpointing | None = None) -> dict[str, 
     MpmoptError
         As `optimise` does.
     """
-    path = Path(os.path.realpath(path))  # a link would be replaced, not what it leads to
+    path = Path(
+        os.path.realpath(place("resume", "path", path))
+    )  # a link would be replaced, not what it leads to
     with locked(path):
         return _go_on(path, runfile.read(path), checkpointing)
 
 
 def drawn(case: Case) -> dict[int, NDArray[np.bool_]]:
-    """Which design particles the case's drawing has, for each coarsening of its stages."""
+    """Which design particles the case's drawing has, for each coarsening of its stages.
+
+    Raises
+    ------
+    DesignError
+        If it does not give (D,) of True and False.
+    """
     there = {}
-    for stage in case.settings.stages:
+    for coarsening, stage in {stage.coarsening: stage for stage in case.settings.stages}.items():
         particles = lay_out(stage.scene(case.scene))
-        there[stage.coarsening] = case.drawing(particles.position[particles.designed])
+        position = particles.position[particles.designed]
+        array, shape = np.asarray(case.drawing(position), dtype=object), (len(position),)
+        kinds = {type(value).__name__ for value in array.ravel().tolist()}
+        if array.shape != shape or not kinds <= {"bool", "bool_"}:
+            raise DesignError(
+                f"Case: drawing gave {', '.join(sorted(kinds))} of shape {array.shape} for "
+                f"positions of shape {position.shape}, must give bool of shape {shape}: whether "
+                "each particle is there"
+            )
+        there[coarsening] = array.astype(bool)
     return there
 
 
@@ -271,9 +307,9 @@ def _go_on(
     return summary
 
 
-def _turned(case: Case, turn: float) -> np.ndarray:
-    """The start's theta and a turn, within [-1, 1]."""
-    theta = np.asarray(case.start["theta"], dtype=float) + turn
+def _turned(theta: NDArray[np.float64], turn: float) -> NDArray[np.float64]:
+    """Theta and a turn, within [-1, 1]."""
+    theta = theta + turn
     return np.where(np.abs(theta) > 1.0, theta - 2.0 * np.sign(theta), theta)
 
 
@@ -284,6 +320,7 @@ def summarise(result: Optimisation, drawing: Mapping[int, NDArray[np.bool_]]) ->
 
     Reference designs count with the better of the first and the best design's actuation.
     """
+    instance("summarise", "result", result, Optimisation)
     best, problem = result.result, result.problem()
     _, *others = audits = audit(problem, best.x)
     first = result.first
@@ -358,7 +395,8 @@ def table(summary: Mapping[str, Any]) -> str:
     width = max(len(name) for name in flat)
     lines = []
     for name, value in flat.items():
-        shown = f"{value:.4f}" if isinstance(value, float) else str(value)
+        values = value if isinstance(value, list) else [value]
+        shown = ", ".join(digits(v) if isinstance(v, float) else str(v) for v in values)
         lines.append(f"{name.replace('_', ' '):<{width}}  {shown}")
     return "\n".join(lines)
 

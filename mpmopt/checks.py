@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
+import os
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mpmopt.errors import MpmoptError, SceneError
+from mpmopt.errors import DesignError, MpmoptError, SceneError
 
 MOST = 10**8  # of anything that is counted
-# Sizes of numbers that a scene may hold, so that products of several are finite and not zero.
+# Sizes of numbers that a scene may hold, so that products of several are finite and not zero:
+# limits of what floats represent, in whatever units, which decide nothing between them.
 TINY, HUGE = 1e-30, 1e30
 
 
@@ -21,6 +24,11 @@ def shown(value: Any) -> str:
     except (ValueError, RecursionError):  # a number of thousands of digits, lists in lists in lists
         return f"a {type(value).__name__}"
     return text if len(text) <= 80 else f"{text[:77]}..."
+
+
+def digits(value: float, count: int = 4) -> str:
+    """A number with so many significant digits: of decimals, small units would leave none."""
+    return f"{value:#.{count}g}".removesuffix(".")
 
 
 def number(
@@ -73,6 +81,30 @@ def count(
     if not least <= value <= most:
         raise error(f"{owner}: {name} = {shown(value)} must be from {least} to {most:.3g}")
     return int(value)
+
+
+def instance(
+    owner: str,
+    name: str,
+    value: Any,
+    kind: type,
+    hint: str = "",
+    *,
+    error: type[MpmoptError] = DesignError,
+) -> None:
+    """An error that says what to write where a value is of another kind."""
+    if not isinstance(value, kind):
+        raise error(
+            f"{owner}: {name} = {shown(value)} must be an object of class {kind.__name__}"
+            f"{hint and f'; {hint}'}"
+        )
+
+
+def place(owner: str, name: str, value: Any) -> Path:
+    """`value` as a path, or an error."""
+    if not isinstance(value, (str, os.PathLike)):
+        raise DesignError(f"{owner}: {name} = {shown(value)} must be a path")
+    return Path(value)
 
 
 def flag(owner: str, name: str, value: Any, *, error: type[MpmoptError] = SceneError) -> bool:

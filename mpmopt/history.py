@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mpmopt.checks import digits
 from mpmopt.errors import DesignError
 from mpmopt.problem import Problem
 from mpmopt.scene import Scene
@@ -233,7 +234,7 @@ class Optimisation:
         if self.best:
             best = self.result
             found = (
-                f"best L = {best.objective:.4f} at stage {best.stage + 1} of {len(stages)}, "
+                f"best L = {digits(best.objective)} at stage {best.stage + 1} of {len(stages)}, "
                 f"beta {best.beta:g}"
             )
         return (

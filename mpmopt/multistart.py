@@ -7,6 +7,7 @@ import dataclasses
 import functools
 import logging
 import math
+import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,10 +17,11 @@ from numpy.typing import NDArray
 
 from mpmopt import runfile
 from mpmopt.binary import Drawing
-from mpmopt.case import RESULTS, Case, run
+from mpmopt.case import RESULTS, Case, drawn, run
+from mpmopt.checks import count, digits, instance, place
 from mpmopt.errors import RunFileError, SweepError
 from mpmopt.files import locked, make_folder, refuse_foreign, replace_file
-from mpmopt.optimize import Settings
+from mpmopt.optimize import Settings, refuse_unfit
 from mpmopt.scene import Design, Scene
 from mpmopt.sweeps import as_csv, connected, refuse_stuck, sweep
 
@@ -108,7 +110,11 @@ def one_start(
 
 
 def multistart(
-    case: Case, out: Path, starts: int, scheduler: str | None = None, force: bool = False
+    case: Case,
+    out: str | os.PathLike[str],
+    starts: int,
+    scheduler: str | None = None,
+    force: bool = False,
 ) -> str:
     """Optimise a case from several starts: its own, and random ones with seeds 1, 2, ...
 
@@ -120,7 +126,7 @@ def multistart(
     Parameters
     ----------
     case : Case
-    out : Path
+    out : str or path
         Folder; on a cluster one that all workers see under this name.
     starts : int
     scheduler : str, optional
@@ -136,12 +142,16 @@ def multistart(
     Raises
     ------
     SweepError
-        If no start came to an end, or the drawing cannot travel to other processes.
+        If no start is asked for or came to an end, or the drawing cannot travel to other processes.
     StorageError
         If the folder cannot be written to or holds foreign files of those names, or another process
         is at work in it.
     """
-    out = Path(out).absolute()
+    instance("multistart", "case", case, Case)
+    starts = count("multistart", "starts", starts, 1, error=SweepError)
+    out = place("multistart", "out", out).absolute()
+    refuse_unfit(case.scene)
+    drawn(case)  # what is wrong with it is told now, not by every start
     make_folder(out)
     table, picture = out / "starts.csv", out / "starts.png"
     if not (out / "starts.h5").exists():
@@ -206,32 +216,37 @@ def _rank(row: dict[str, Any]) -> tuple[float, float]:
 
 def report(rows: Sequence[dict[str, Any]]) -> str:
     """The rows as aligned text, their spread, and the best."""
-    columns = {
-        "start": ("start", "d"),
-        "post_processed": ("post-processed", ".3f"),
-        "gain": (" gain", ".3f"),
-        "kept_half_step": ("kept at half step", ".0%"),
-        "kept_half_cells": ("at half cells", ".0%"),
-        "audited_gain": ("audited gain", ".3f"),
-        "loose_particles": ("loose", "d"),
-        "failed_evaluations": ("failed", "d"),
-        "seconds": ("seconds", ".0f"),
+    columns: dict[str, tuple[str, Callable[[Any], str]]] = {
+        "start": ("start", str),
+        "post_processed": ("post-processed", _length),
+        "gain": ("     gain", _length),
+        "kept_half_step": ("kept at half step", "{:.0%}".format),
+        "kept_half_cells": ("at half cells", "{:.0%}".format),
+        "audited_gain": ("audited gain", _length),
+        "loose_particles": ("loose", str),
+        "failed_evaluations": ("failed", str),
+        "seconds": ("seconds", "{:.0f}".format),
     }
     lines = ["  ".join(heading for heading, _ in columns.values())]
     for row in rows:
-        cells = (f"{row[name]:{form}}".rjust(len(head)) for name, (head, form) in columns.items())
+        cells = (form(row[name]).rjust(len(head)) for name, (head, form) in columns.items())
         lines.append("  ".join(cells))
     for name in ("gain", "audited_gain"):
         values = [row[name] for row in rows if math.isfinite(row[name])]
         if values:
             low, middle, high = np.percentile(values, (0, 50, 100))
             lines.append(
-                f"{name.replace('_', ' ')}: {low:.3f} to {high:.3f}, median {middle:.3f}, standard "
-                f"deviation {np.std(values):.3f}"
+                f"{name.replace('_', ' ')}: {_length(low)} to {_length(high)}, median "
+                f"{_length(middle)}, standard deviation {_length(float(np.std(values)))}"
             )
     best = best_of(rows)
-    lines.append(f"best after its audit: start-{best['start']}, gain {best['audited_gain']:.3f}")
+    gain = _length(best["audited_gain"])
+    lines.append(f"best after its audit: start-{best['start']}, gain {gain}")
     return "\n".join(lines)
+
+
+def _length(value: float) -> str:
+    return digits(value, 3)
 
 
 def draw(path: Path, out: Path, rows: Sequence[dict[str, Any]]) -> None:
@@ -271,7 +286,7 @@ def draw(path: Path, out: Path, rows: Sequence[dict[str, Any]]) -> None:
             draw_design(axis, kept.problem(), kept.best)
         except RunFileError as error:
             logger.warning("no picture of start %d's design: %s", row["start"], error)
-        axis.set_title(f"start {row['start']}: {row['audited_gain']:.3f}", fontsize=9)
+        axis.set_title(f"start {row['start']}: {_length(row['audited_gain'])}", fontsize=9)
     for axis in lower.axes:
         axis.set_axis_off()
     replace_file(path, png(figure))

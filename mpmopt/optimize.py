@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from mpmopt import audit
 from mpmopt.binary import post_processed
 from mpmopt.checkpoints import Checkpointing
-from mpmopt.checks import count, flag, number, share
+from mpmopt.checks import count, flag, instance, number, share, shown
 from mpmopt.design import greyness
 from mpmopt.errors import DesignError, SceneError, SimulationError
 from mpmopt.history import Candidate, Iteration, Leg, Optimisation, StageState
@@ -28,6 +28,8 @@ logger = logging.getLogger(__name__)
 
 # Factors on the move limit after a step that went back, and after one that went on.
 SHORTEN, LENGTHEN = 0.6, 1.2
+# Successful evaluations of a stage before the stop rule may end it.
+LEAST = 20
 # How often a stage of which no design runs halves its time step before the run gives up.
 HALVINGS = 3
 
@@ -84,8 +86,9 @@ class Stage:
         for name in ("beta", "mass_floor", "stiffness_floor", "time_step", "move_limit"):
             value = number("Stage", name, getattr(self, name), above=0.0, error=DesignError)
             object.__setattr__(self, name, value)
-        if self.move_limit > 1.0:
-            raise DesignError(f"Stage: move_limit = {self.move_limit} must be at most 1")
+        for name in ("mass_floor", "stiffness_floor", "move_limit"):
+            if getattr(self, name) > 1.0:
+                raise DesignError(f"Stage: {name} = {getattr(self, name)} must be at most 1")
         leave_out = share("Stage", "leave_out", self.leave_out, error=DesignError)
         object.__setattr__(self, "leave_out", leave_out)
         for name in ("solid", "audited"):
@@ -128,6 +131,7 @@ class Settings:
     Attributes
     ----------
     stages : tuple of Stage
+        Or a single one.
     adapt_move_limit : bool
         Shorten the move limit after a step that went back, and lengthen it, up to the stage's,
         after one that went on.
@@ -138,8 +142,12 @@ class Settings:
     window : int
         Iterations in the moving average of the stop rule.
     tolerance : float
-        A stage ends when the moving average changes by no more than this.
-    least_iterations, most_iterations : int
+        A stage ends when the moving average changes by no more than this share of the grid's
+        longer side.
+    least_iterations : int, optional
+        Successful evaluations of a stage before the stop rule may end it; default: 20, or
+        `most_iterations` if that is less.
+    most_iterations : int
         Successful evaluations of a stage.
     most_failures : int
         Failed evaluations in a row after which the optimisation gives up.
@@ -158,22 +166,25 @@ class Settings:
     best_first: bool = True
     window: int = 10
     tolerance: float = 2e-4
-    least_iterations: int = 20
+    least_iterations: int | None = None
     most_iterations: int = 200
     most_failures: int = 8
     scouting: int = 0
 
     def __post_init__(self) -> None:
-        if not self.stages or not all(isinstance(stage, Stage) for stage in self.stages):
-            raise DesignError(f"Settings: stages = {self.stages!r} must be Stages, at least one")
-        object.__setattr__(self, "stages", tuple(self.stages))
+        given: Any = self.stages
+        stages = tuple(given) if isinstance(given, Iterable) else (given,)
+        if not stages or not all(isinstance(stage, Stage) for stage in stages):
+            raise DesignError(f"Settings: stages = {shown(given)} must be Stages, at least one")
+        object.__setattr__(self, "stages", stages)
         for name in ("adapt_move_limit", "sharpen_asymptotes", "best_first"):
             value = flag("Settings", name, getattr(self, name), error=DesignError)
             object.__setattr__(self, name, value)
         for name in ("window", "least_iterations", "most_iterations", "most_failures"):
-            object.__setattr__(
-                self, name, count("Settings", name, getattr(self, name), 1, error=DesignError)
-            )
+            given = getattr(self, name)
+            if name != "least_iterations" or given is not None:
+                given = count("Settings", name, given, 1, error=DesignError)
+                object.__setattr__(self, name, given)
         scouting = count("Settings", "scouting", self.scouting, 0, error=DesignError)
         object.__setattr__(self, "scouting", scouting)
         if scouting > len(self.stages):
@@ -182,13 +193,19 @@ class Settings:
             )
         tolerance = number("Settings", "tolerance", self.tolerance, error=DesignError)
         object.__setattr__(self, "tolerance", tolerance)
-        if self.least_iterations > self.most_iterations:
+        if self.least > self.most_iterations:
             raise DesignError(
                 f"Settings: least_iterations = {self.least_iterations} is above "
                 f"most_iterations = {self.most_iterations}"
             )
         if self.tolerance < 0.0:
             raise DesignError(f"Settings: tolerance = {self.tolerance} must not be negative")
+
+    @property
+    def least(self) -> int:
+        """`least_iterations`, or what it is by default."""
+        default = min(LEAST, self.most_iterations)
+        return default if self.least_iterations is None else self.least_iterations
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Settings:
@@ -197,13 +214,14 @@ class Settings:
 
 
 Callback = Callable[[Optimisation], None]
+HOW = "write Settings(stages), or call what makes them, such as sharpened(time_step)"
 
 
 def optimise(
     scene: Scene,
     settings: Settings,
-    start: NDArray[np.float64] | Sequence[NDArray[np.float64]],
-    callbacks: Iterable[Callback] = (),
+    start: NDArray[np.float64] | Sequence[float] | Sequence[NDArray[np.float64]],
+    callbacks: Iterable[Callback] | Callback = (),
     checkpointing: Checkpointing | None = None,
 ) -> Optimisation:
     """Maximise the distance travelled, stage by stage.
@@ -219,16 +237,18 @@ def optimise(
     start : (n,) array, or several
         First design, within [-1, 1], of the first stage's scene (`Problem.join` makes it). Of
         several the best after `Settings.scouting` stages goes on.
-    callbacks : iterable of callable
+    callbacks : iterable of callable, or one
         Called after each evaluation and once at the end.
     checkpointing : Checkpointing, optional
 
     Raises
     ------
     DesignError
-        If `start` does not fit the scene, or there is nothing to design.
+        If `start` does not fit the scene, there is nothing to design, or anything is of another
+        kind.
     SceneError
-        If a stage cannot be simulated; all are checked before the first evaluation.
+        If a stage cannot be simulated, nothing actuates the body, it is in several pieces, or has
+        one particle per cell; all is checked before the first evaluation.
     StorageError
         If checkpoints cannot be stored.
     """
@@ -238,7 +258,7 @@ def optimise(
 def begin(
     scene: Scene,
     settings: Settings,
-    start: NDArray[np.float64] | Sequence[NDArray[np.float64]],
+    start: NDArray[np.float64] | Sequence[float] | Sequence[NDArray[np.float64]],
 ) -> Optimisation:
     """An optimisation before its first evaluation, for `go_on`; see `optimise`.
 
@@ -247,7 +267,12 @@ def begin(
     DesignError, SceneError
         As `optimise`.
     """
-    starts = [start] if isinstance(start, np.ndarray) else list(start)
+    instance("optimise", "scene", scene, Scene)
+    instance("optimise", "settings", settings, Settings, HOW)
+    several = isinstance(start, Iterable) and not isinstance(start, np.ndarray)
+    starts: list[Any] = list(start) if several else [start]
+    if starts and all(isinstance(value, (int, float, np.number)) for value in starts):
+        starts = [starts]
     scenes = [stage.scene(scene) for stage in settings.stages]
     first = Problem(scenes[0])
     designs = [first.join(*first.split(x)) for x in starts]
@@ -258,9 +283,41 @@ def begin(
     return Optimisation(scene, settings, [Leg(k, x) for k, x in enumerate(designs)])
 
 
+def refuse_unfit(scene: Scene) -> None:
+    """Refuse a body that no optimisation makes a robot of, though it can be simulated.
+
+    Raises
+    ------
+    SceneError
+        If nothing actuates it, any stretch tears it, or it is in several pieces.
+    """
+    if not scene.actuators:
+        raise SceneError("optimise: the body has no Actuator, so it does not go by itself; add one")
+    if scene.particles_per_cell == 1:
+        raise SceneError(
+            "optimise: particles_per_cell = 1 leaves a cell without a particle at any stretch, and "
+            "no body that may crack there counts; take 2 or more"
+        )
+    first, *apart = scene.body
+    held = [first]
+    for region in held:  # which grows
+        held += [other for other in apart if scene.gap(region, other) is None]
+        apart = [other for other in apart if other not in held]
+    if not apart:
+        return
+    gap, region, other = min(
+        ((scene.gap(a, b) or 0.0, a, b) for a in apart for b in held), key=lambda item: item[0]
+    )
+    how = f"ends {gap:.4g} ({gap / scene.grid.dx:.4g} cells) before" if gap else "only touches"
+    raise SceneError(
+        f"optimise: the body is in pieces: {region} {how} {other}{'' if gap else ' at a corner'}; "
+        "let them share an edge, or put a Design or a Solid between them"
+    )
+
+
 def go_on(
     run: Optimisation,
-    callbacks: Iterable[Callback] = (),
+    callbacks: Iterable[Callback] | Callback = (),
     checkpointing: Checkpointing | None = None,
 ) -> Optimisation:
     """Go on with an optimisation from where it stands to its end; see `optimise`.
@@ -273,8 +330,17 @@ def go_on(
     SceneError, StorageError
         As `optimise`.
     DesignError
-        If its legs do not fit its settings.
+        If its legs do not fit its settings, or a callback is none.
     """
+    instance("go_on", "run", run, Optimisation)
+    several = isinstance(callbacks, Iterable) and not callable(callbacks)
+    all_callbacks: list[Any] = list(callbacks) if several else [callbacks]  # type: ignore[arg-type]
+    for callback in all_callbacks:
+        if isinstance(callback, type) or not callable(callback):
+            raise DesignError(
+                f"callback {shown(callback)} must be a function of the run, or an object that is "
+                "called like one, such as ProgressBar()"
+            )
     stages = len(run.settings.stages)
     for index, leg in enumerate(run.legs):
         if leg.start != index or not 0 <= leg.stage <= stages:
@@ -282,7 +348,9 @@ def go_on(
                 f"leg {index} is of start {leg.start}, at stage {leg.stage} of {stages}: the run "
                 "was changed, take a copy of it"
             )
-    climb = _Climb(run, tuple(callbacks), checkpointing)
+    if not run.history:
+        refuse_unfit(run.scene)
+    climb = _Climb(run, tuple(all_callbacks), checkpointing)
     if run.stop_reason:
         return run
     scouting = run.settings.scouting if len(run.legs) > 1 else 0
@@ -351,6 +419,8 @@ class _StageRun:
         self.whole, self.run, self.leg = whole, whole.run, leg
         settings = self.run.settings
         self.stage = settings.stages[leg.stage]
+        # All lengths are taken in these, so that no unit decides anything.
+        self.width = max(self.run.scene.grid.size)
         state = self.run.stage_state
         self._pose(state.time_step if state else None)
         self.mma = MovingAsymptotes(
@@ -417,11 +487,17 @@ class _StageRun:
         if self.failures and self.farthest is not None:
             mma.reset()
             mma.move_limit /= 2.0
-            return mma.step(self.farthest.x, -self.farthest.objective, -self.farthest_gradient)
+            return self._move(self.farthest.x, self.farthest.objective, self.farthest_gradient)
         went_back = len(self.values) > 1 and self.values[-1] < self.values[-2]
         factor = SHORTEN if went_back and self.run.settings.adapt_move_limit else LENGTHEN
         mma.move_limit = min(self.stage.move_limit, factor * mma.move_limit)
-        return mma.step(x, -self.values[-1], -self.gradient)
+        return self._move(x, self.values[-1], self.gradient)
+
+    def _move(
+        self, x: NDArray[np.float64], value: float, gradient: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """The step of the moving asymptotes from x."""
+        return self.mma.step(x, -value / self.width, -gradient / self.width)
 
     def _best_before(self) -> NDArray[np.float64] | None:
         """The best design of the stage before, on this stage's grid."""
@@ -534,14 +610,15 @@ class _StageRun:
                 return f"it gave up after {self.failures} failed evaluations in a row."
             return ""
         values, count, window = self.values, len(self.values), settings.window
-        if count >= max(settings.least_iterations, window + 1):
+        if count >= max(settings.least, window + 1):
             change = abs(np.mean(values[-window:]) - np.mean(values[-window - 1 : -1]))
-            if change <= settings.tolerance:
+            limit = settings.tolerance * self.width
+            if change <= limit:
                 last = self.run.history[-1]
                 return (
                     f"the mean objective over {window} iterations changed by {change:.1e} <= "
-                    f"{settings.tolerance:.1e} after {count} of them (last step {last.step:.1e} of "
-                    f"the range, projected gradient {last.projected_gradient:.1e})."
+                    f"{limit:.1e} after {count} of them (last step {last.step:.1e} of the range, "
+                    f"projected gradient {last.projected_gradient:.1e})."
                 )
         if count >= (self.stage.most_iterations or settings.most_iterations):
             return f"it reached its limit of {count} iterations."

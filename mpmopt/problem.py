@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from mpmopt.actuation import signal, signal_adjoint
 from mpmopt.checkpoints import Checkpointing
-from mpmopt.checks import count, share
+from mpmopt.checks import count, instance, share
 from mpmopt.design import DesignChain
 from mpmopt.errors import DesignError, SimulationError, TornError
 from mpmopt.objective import Objective
@@ -27,6 +27,12 @@ logger = logging.getLogger(__name__)
 # An evaluation that goes beyond these is not trusted (docs: theory, "Step control"); the stretch is
 # over the particles per cell and direction.
 LIMITS = Margins(courant=1.0, spin=0.5, jacobian=0.01, stretch=1.5, energy=0.05)
+
+
+PICTURE = (
+    ": its entries are values at problem.particles.position[problem.particles.designed], column by "
+    "column from below; look a picture up there (see Problem.join), do not ravel it"
+)
 
 
 class Variables(NamedTuple):
@@ -108,7 +114,7 @@ class Problem:
     Raises
     ------
     DesignError
-        If beta, `leave_out`, `redo` or `precision` makes no sense.
+        If the scene is none, or beta, `leave_out`, `redo` or `precision` makes no sense.
     """
 
     def __init__(
@@ -120,12 +126,14 @@ class Problem:
         redo: int = 2,
         precision: Precision = "double",
     ) -> None:
+        instance("Problem", "scene", scene, Scene)
+        self.checkpointing = Checkpointing() if checkpointing is None else checkpointing
+        instance("Problem", "checkpointing", self.checkpointing, Checkpointing)
         self.scene = scene
         self.precision: Precision = check_precision(precision)
         self._memories: list[Memory] = []
         self.leave_out = share("Problem", "leave_out", leave_out, error=DesignError)
         self.redo = count("Problem", "redo", redo, 0, error=DesignError)
-        self.checkpointing = checkpointing or Checkpointing()
         self.particles = lay_out(scene)
         self.chain = DesignChain(scene, self.particles, beta)
         self._designed = int(self.particles.designed.sum())
@@ -134,17 +142,41 @@ class Problem:
     def join(self, phi: Any, a: Any, theta: Any, b: Any) -> NDArray[np.float64]:
         """The vector x of named variables; single numbers stand for all entries.
 
+        The entries of phi belong to the design particles, column by column from below, whatever
+        their regions: to positions, not to the rows of a picture. So a picture is looked up there;
+        one that is raveled would be scrambled, and no size tells.
+
         Raises
         ------
         DesignError
             If a shape does not fit or an entry is no real number.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from mpmopt.problem import Problem
+        >>> from mpmopt.scene import Actuator, Design, Grid, Scene
+        >>> c = 1 / 16
+        >>> body = Design((4 * c, 4 * c), (8 * c, 6 * c)), Actuator((4 * c, 6 * c), (8 * c, 7 * c))
+        >>> problem = Problem(Scene(Grid((16, 16), c), 4e-3, 10, body))
+        >>> picture = np.array([[1.0, 1.0, 1.0, 1.0], [1.0, -1.0, -1.0, 1.0]])  # two legs
+        >>> right, up = problem.particles.position[problem.particles.designed].T
+        >>> row, column = ((6 * c - up) / c).astype(int), ((right - 4 * c) / c).astype(int)
+        >>> x = problem.join(picture[row, column], a=1.0, theta=-0.3, b=-0.5)
+        >>> print(x[:8])  # the first two columns of particles: the left leg
+        [1. 1. 1. 1. 1. 1. 1. 1.]
+        >>> print(x[8:12])  # the next one: the gap, and the row above it
+        [-1. -1.  1.  1.]
         """
         sizes = (self._designed,) + 3 * (len(self.scene.actuators),)
         parts = []
         for name, value, size in zip(Variables._fields, (phi, a, theta, b), sizes):
             array = _real(name, value)
             if array.size not in (1, size) or array.ndim > 1:
-                raise DesignError(f"{name} has shape {array.shape}, must have {(size,)} or ()")
+                hint = PICTURE if name == "phi" else ""
+                raise DesignError(
+                    f"{name} has shape {array.shape}, must have {(size,)} or (){hint}"
+                )
             parts.append(np.broadcast_to(array, size))
         return np.concatenate(parts)
 
@@ -159,7 +191,10 @@ class Problem:
         x = _array("x", x)
         x = x if x.dtype == complex else _real("x", x)
         if x.shape != (self.size,):
-            raise DesignError(f"x has shape {x.shape}, this problem's variables {(self.size,)}")
+            raise DesignError(
+                f"x has shape {x.shape}, this problem's variables {(self.size,)}; Problem.join "
+                "makes x of its parts"
+            )
         outside = ~(np.abs(x.real) <= 1.0)
         if outside.any():
             raise DesignError(
@@ -173,6 +208,7 @@ class Problem:
 
         Each design particle takes phi from the nearest one of the other problem's.
         """
+        instance("Problem.transfer", "other", other, Problem)
         parts = other.split(x)
         phi = parts.phi[nearest_designed(self.particles, other.particles)]
         return self.join(phi, parts.a, parts.theta, parts.b)

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 import platform
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -31,6 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import mpmopt
+from mpmopt.checks import instance, place
 from mpmopt.errors import RunFileError, StorageError
 from mpmopt.files import replace_file
 from mpmopt.history import Candidate, Iteration, Leg, Optimisation, StageState
@@ -133,7 +135,7 @@ class RunFile:
 
 
 def write(
-    path: Path,
+    path: str | os.PathLike[str],
     run: Optimisation,
     summary: Mapping[str, Any] | None = None,
     drawing: Mapping[int, NDArray[np.bool_]] | None = None,
@@ -142,7 +144,7 @@ def write(
 
     Parameters
     ----------
-    path : Path
+    path : str or path
     run : Optimisation
     summary : mapping, optional
         Of a finished run.
@@ -154,6 +156,8 @@ def write(
     StorageError
         If the file cannot be written, or nothing would read it back; an older one is still whole.
     """
+    path = place("runfile.write", "path", path)
+    instance("runfile.write", "run", run, Optimisation)
     # HDF5 does not survive a write that fails, so it writes to memory only.
     with h5py.File(f"run-{uuid4()}", "w", driver="core", backing_store=False) as file:
         _fill(file, run)
@@ -167,7 +171,7 @@ def write(
             f"{path} would have {len(image):.3g} bytes, more than {LARGEST:.0e}, which nothing "
             "reads back; take fewer stages or starts, or fewer particles"
         )
-    replace_file(Path(path), sealed(image))
+    replace_file(path, sealed(image))
 
 
 def _fill(file: h5py.File, run: Optimisation) -> None:
@@ -236,7 +240,7 @@ def versions() -> dict[str, str]:
     }
 
 
-def read(path: Path) -> RunFile:
+def read(path: str | os.PathLike[str]) -> RunFile:
     """Read a run file.
 
     Raises
@@ -244,7 +248,7 @@ def read(path: Path) -> RunFile:
     RunFileError
         If it does not exist, is no run file, is damaged or of another version.
     """
-    path = Path(path)
+    path = place("runfile.read", "path", path)
     with refusing(path, "run file", RunFileError):
         if not path.is_file():
             raise RunFileError(f"{path} is not there; give the path of a run.h5")

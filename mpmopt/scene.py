@@ -142,6 +142,9 @@ class Region(_Checked):
                 f"{owner}: lower corner {self.lower} must be left of and below upper {self.upper}"
             )
 
+    def __str__(self) -> str:
+        return f"{type(self).__name__} {self.lower} to {self.upper}"
+
 
 @dataclass(frozen=True)
 class Design(Region):
@@ -280,7 +283,8 @@ class Scene(_Checked):
     direction : (float, float), optional
         Unit vector e of the objective.
     particles_per_cell : int, optional
-        Particles per cell and direction.
+        Particles per cell and direction; `optimise` needs two or more, which bear stretches up to
+        as many.
     filter_weights : (float, float, float), optional
         Weights w0, w1, w2 of the design filter's 3 x 3 convolution: w0 + 4 w1 + 4 w2 = 1.
     filter_length : float, optional
@@ -586,6 +590,14 @@ class Scene(_Checked):
             round(x1 / spacing),
             round(y1 / spacing),
         )
+
+    def gap(self, region: Region, other: Region) -> float | None:
+        """How far two regions are apart; None if they share an edge, which holds them together."""
+        (low, high), (other_low, other_high) = self.lattice(region), self.lattice(other)
+        apart = [max(low[k] - other_high[k], other_low[k] - high[k]) for k in (0, 1)]
+        if max(apart) == 0 and min(apart) < 0:
+            return None
+        return math.hypot(*(max(a, 0) for a in apart)) * self.grid.dx / self.particles_per_cell
 
     @property
     def largest_time_step(self) -> float:

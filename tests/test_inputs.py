@@ -1,0 +1,228 @@
+"""What users hand over: other kinds work where they can only mean one thing, or are named."""
+
+import dataclasses
+import doctest
+
+import numpy as np
+import pytest
+from conftest import SHORT, small_scene
+
+from mpmopt import runfile
+from mpmopt.audit import audit
+from mpmopt.binary import full_block
+from mpmopt.case import Case, ProgressBar, drawn, resume, run, sharpened, summarise
+from mpmopt.checkpoints import Checkpointing
+from mpmopt.errors import DesignError, SceneError, SweepError
+from mpmopt.multistart import multistart
+from mpmopt.optimize import Settings, Stage, begin, go_on, optimise, refuse_unfit
+from mpmopt.problem import Problem
+from mpmopt.scene import Actuator, Design, Mirror, Scene, Solid
+
+C = 1 / 16
+SCENE = small_scene(steps=4)
+PROBLEM = Problem(SCENE)
+START = PROBLEM.join(0.0, 1.0, -0.3, -0.5)
+STAGE = SHORT.stages[0]
+CASE = Case(SCENE, SHORT, full_block)
+
+
+def test_one_stage_one_list_of_numbers_and_one_callback_are_enough():
+    settings = dataclasses.replace(SHORT, stages=STAGE)
+    assert settings == SHORT == dataclasses.replace(SHORT, stages=iter([STAGE]))
+    calls = []
+    for start in (list(START), tuple(START), (x for x in [START])):
+        optimise(SCENE, settings, start, calls.append)
+        assert np.array_equal(calls[-1].first.x, START)
+    assert len(calls) == 3 * (2 + 1)
+
+
+def test_few_iterations_need_no_word_about_the_least():
+    few = Settings(STAGE, most_iterations=10)
+    assert (few.least, Settings(STAGE).least) == (10, 20)
+    assert dataclasses.replace(sharpened(8e-4), most_iterations=5).least == 5
+    assert Settings.from_dict(dataclasses.asdict(few)) == few
+    with pytest.raises(DesignError, match="least_iterations = 11 is above most_iterations = 10"):
+        dataclasses.replace(few, least_iterations=11)
+    still = dataclasses.replace(few, tolerance=1.0, window=1, most_iterations=3)
+    assert len(optimise(SCENE, still, START).history) == 3
+
+
+@pytest.mark.parametrize(
+    ("call", "says"),
+    [
+        (lambda: Settings(5), "stages = 5 must be Stages"),
+        (lambda: Settings(Stage), "must be Stages"),
+        (lambda: Settings(STAGE, tolerance=np.nan), "tolerance = nan must be finite"),
+        (lambda: Stage(1.0, 2.0, 1e-3, 1e-3), "mass_floor = 2.0 must be at most 1"),
+        (lambda: Stage(1.0, 1e-3, 2.0, 1e-3), "stiffness_floor = 2.0 must be at most 1"),
+        (lambda: optimise(Scene, SHORT, START), "scene = .* class Scene"),
+        (lambda: optimise(SCENE, sharpened, START), "settings = .*sharpened.* such as sharpened"),
+        (lambda: optimise(SCENE, (STAGE,), START), "settings = .* write Settings"),
+        (lambda: optimise(SCENE, SHORT, None), "x holds object"),
+        (lambda: optimise(SCENE, SHORT, 0.3), "x has shape .*Problem.join"),
+        (lambda: optimise(SCENE, SHORT, PROBLEM.split(START)), "x has shape .*Problem.join"),
+        (lambda: optimise(SCENE, SHORT, START, [ProgressBar]), r"such as ProgressBar\(\)"),
+        (lambda: optimise(SCENE, SHORT, START, ProgressBar), r"such as ProgressBar\(\)"),
+        (lambda: optimise(SCENE, SHORT, START, 5), "callback 5 must be a function"),
+        (lambda: optimise(SCENE, SHORT, START, (), "disk"), "class Checkpointing"),
+        (lambda: optimise(SCENE, SHORT, START, (), Checkpointing), "class Checkpointing"),
+        (lambda: go_on(CASE), "run = .* class Optimisation"),
+        (lambda: Problem(Scene), "scene = .* class Scene"),
+        (lambda: Problem(SCENE, 1.0, 0), "checkpointing = 0 .* class Checkpointing"),
+        (lambda: PROBLEM.transfer(SCENE, START), "class Problem"),
+        (lambda: audit(SCENE, START), "class Problem"),
+        (lambda: summarise(CASE, {}), "class Optimisation"),
+        (lambda: dataclasses.replace(CASE, settings=sharpened), "such as sharpened"),
+        (lambda: dataclasses.replace(CASE, scene=Scene), "class Scene"),
+        (lambda: dataclasses.replace(CASE, drawing=np.ones(32, bool)), "function of positions"),
+        (lambda: dataclasses.replace(CASE, start=START), "class Mapping"),
+    ],
+)
+def test_what_is_of_another_kind_is_named(call, says):
+    with pytest.raises(DesignError, match=says):
+        call()
+
+
+@pytest.mark.parametrize(
+    ("call", "says"),
+    [
+        (lambda out: run(SCENE, out), "class Case"),
+        (lambda out: run(CASE, None), "out = None must be a path"),
+        (lambda out: run(CASE, out, "disk"), "class Checkpointing"),
+        (lambda out: run(CASE, out, phi=0.5), "phi = 0.5 must be a function"),
+        (lambda out: run(dataclasses.replace(CASE, start={"theta": "a"}), out), "theta holds"),
+        (lambda out: run(dataclasses.replace(CASE, start={"theta": np.nan}), out), "nan"),
+        (lambda out: resume(None), "path = None must be a path"),
+        (lambda out: runfile.read(None), "path = None must be a path"),
+        (lambda out: runfile.write(out / "run.h5", CASE), "class Optimisation"),
+        (lambda out: runfile.write(5, begin(SCENE, SHORT, START)), "path = 5 must be a path"),
+        (lambda out: multistart(CASE, out, 1.5), "starts = 1.5 must be a whole number"),
+        (lambda out: multistart(CASE, out, 0), "starts = 0 must be from 1"),
+        (lambda out: multistart(SCENE, out, 1), "class Case"),
+    ],
+)
+def test_what_is_of_another_kind_is_named_before_anything_is_written(tmp_path, call, says):
+    with pytest.raises((DesignError, SweepError), match=says):
+        call(tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_texts_are_paths_too(tmp_path, monkeypatch):
+    monkeypatch.setattr("mpmopt.case._draw", lambda *_: None)
+    summary = run(CASE, str(tmp_path / "out"))
+    path = str(tmp_path / "out" / "run.h5")
+    assert resume(path) == summary
+    runfile.write(path, runfile.read(path).run)
+    assert runfile.read(path).summary == {}
+
+
+@pytest.mark.parametrize(
+    ("drawing", "says"),
+    [
+        (lambda position: np.ones(31, bool), r"bool of shape \(31,\).* \(32, 2\).*\(32,\)"),
+        (lambda position: np.ones((32, 1), bool), r"shape \(32, 1\)"),
+        (lambda position: None, "NoneType of shape"),
+        (lambda position: np.ones(len(position)), r"float of shape \(32,\)"),
+        (lambda position: [[True], [True, False]], "list of shape"),
+    ],
+)
+def test_a_drawing_that_is_none_is_found_before_anything_is_written(tmp_path, drawing, says):
+    case = dataclasses.replace(CASE, drawing=drawing)
+    for call in (lambda: run(case, tmp_path / "out"), lambda: multistart(case, tmp_path, 1)):
+        with pytest.raises(DesignError, match=says):
+            call()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_drawing_is_looked_at_on_the_grid_of_every_stage(tmp_path):
+    stages = (dataclasses.replace(STAGE, coarsening=2), STAGE)
+    scene = small_scene(
+        steps=4,
+        body=(
+            Design((4 * C, 4 * C), (8 * C, 6 * C)),
+            Actuator((4 * C, 6 * C), (8 * C, 8 * C)),
+        ),
+        walls=(),
+    )
+    case = Case(scene, dataclasses.replace(SHORT, stages=stages), lambda p: np.ones(8, bool))
+    with pytest.raises(DesignError, match=r"\(8,\) for positions of shape \(32, 2\)"):
+        run(case, tmp_path)
+    listed = dataclasses.replace(case, drawing=lambda position: [True] * len(position))
+    assert {k: v.size for k, v in drawn(listed).items()} == {2: 8, 1: 32}
+
+
+def pieces(*body, **changes):
+    return small_scene(steps=4, walls=(), body=body, gravity=(0.0, 0.0), **changes)
+
+
+DESIGN = Design((3 * C, 4 * C), (5 * C, 6 * C))
+
+
+LOOSE = Solid((6 * C, 7.5 * C), (7 * C, 8 * C))
+
+
+@pytest.mark.parametrize(
+    ("scene", "says"),
+    [
+        (
+            pieces(Actuator((10 * C, 4 * C), (12 * C, 5 * C)), DESIGN),
+            ["Design (0.1875, ", "ends 0.3125 (5 cells) before Actuator (0.625, ", "an edge"],
+        ),
+        (
+            pieces(DESIGN, Actuator((5 * C, 6 * C), (6 * C, 7 * C))),
+            ["Actuator (0.3125, 0.375)", "only touches Design", "at a corner"],
+        ),
+        (
+            pieces(DESIGN, Actuator((3 * C, 6 * C), (5 * C, 7 * C)), LOOSE),
+            ["Solid (0.375, 0.46875)", "ends 0.06988 (1.118 cells) before Actuator"],
+        ),
+        (pieces(DESIGN, Actuator((3 * C, 6.5 * C), (5 * C, 7 * C))), ["0.03125 (0.5 cells)"]),
+        (small_scene(steps=4, particles_per_cell=1), ["particles_per_cell = 1", "2 or more"]),
+        (pieces(DESIGN, Solid((3 * C, 6 * C), (5 * C, 7 * C))), ["no Actuator", "add one"]),
+    ],
+)
+def test_a_body_that_makes_no_robot_can_be_simulated_but_not_optimised(tmp_path, scene, says):
+    problem = Problem(scene)
+    x = problem.join(0.0, 0.0, 0.0, 0.0)
+    assert np.isfinite(problem.value(x))
+    case = Case(scene, SHORT, full_block)
+    for call in (
+        lambda: optimise(scene, SHORT, x),
+        lambda: run(case, tmp_path),
+        lambda: multistart(case, tmp_path, 1),
+    ):
+        with pytest.raises(SceneError) as error:
+            call()
+        for part in says:
+            assert part in str(error.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_body_that_hangs_together_through_others_is_optimised():
+    around = pieces(
+        Actuator((3 * C, 4 * C), (4 * C, 6 * C)),
+        Solid((6 * C, 4 * C), (7 * C, 5 * C)),
+        Design((4 * C, 4 * C), (6 * C, 4.5 * C)),
+        mirror=None,
+    )
+    refuse_unfit(around)
+    halves = pieces(
+        Design((3 * C, 6 * C), (5 * C, 7 * C)),
+        Actuator((3 * C, 7 * C), (5 * C, 9 * C)),
+        Design((3 * C, 9 * C), (5 * C, 10 * C)),
+        mirror=Mirror("y", 8 * C),
+    )
+    refuse_unfit(halves)
+
+
+def test_a_picture_as_phi_is_told_where_its_entries_are():
+    with pytest.raises(DesignError, match=r"\(4, 8\).*\(32,\).*column by column from below; look"):
+        PROBLEM.join(np.zeros((4, 8)), 0.0, 0.0, 0.0)
+    with pytest.raises(DesignError, match=r"b has shape \(3,\), must have \(2,\) or \(\)$"):
+        PROBLEM.join(0.0, 0.0, 0.0, [0.0, 0.1, 0.2])
+    found = doctest.DocTestFinder().find(Problem.join, "join", globs={})
+    assert [doctest.DocTestRunner().run(test).failed for test in found] == [0]
+    assert found[0].examples
+    # What the example says of the order: of each column of the lattice, the lowest first.
+    x, y = PROBLEM.particles.position[PROBLEM.particles.designed].T
+    assert np.array_equal(np.lexsort((y, x)), np.arange(x.size))

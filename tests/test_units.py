@@ -1,0 +1,168 @@
+"""No absolute length, mass or time decides anything, or is lost where it is printed."""
+
+import dataclasses
+import re
+
+import numpy as np
+import pytest
+from conftest import small_scene
+
+from mpmopt import __main__ as commands
+from mpmopt import runfile
+from mpmopt.case import ProgressBar, summarise, table
+from mpmopt.multistart import random_start, report
+from mpmopt.optimize import Settings, Stage, optimise
+from mpmopt.problem import Problem
+from mpmopt.scene import Actuator, Design, Grid
+
+# What is a length; the rest has no unit.
+LENGTHS = ("objective", "post_processed", "audited", "projected_gradient")
+
+
+def scaled(scene, length, mass, time):
+    """The same scene in other units."""
+    stress = mass / time**2
+
+    def region(part):
+        changes = {
+            name: tuple(length * v for v in getattr(part, name)) for name in ("lower", "upper")
+        }
+        if isinstance(part, Actuator):
+            changes["stress"] = tuple(tuple(stress * s for s in row) for row in part.stress)
+            changes["angular_frequency"] = part.angular_frequency / time
+        return dataclasses.replace(part, **changes)
+
+    material = scene.material
+    return dataclasses.replace(
+        scene,
+        grid=Grid(scene.grid.cells, length * scene.grid.dx),
+        time_step=time * scene.time_step,
+        body=tuple(region(part) for part in scene.body),
+        walls=tuple(dataclasses.replace(w, position=length * w.position) for w in scene.walls),
+        material=dataclasses.replace(
+            material,
+            density=mass / length**2 * material.density,
+            lame_lambda=stress * material.lame_lambda,
+            lame_mu=stress * material.lame_mu,
+        ),
+        gravity=tuple(length / time**2 * g for g in scene.gravity),
+        filter_length=length * scene.filter_length,
+        blend_time=time * scene.blend_time,
+        transient=time * scene.transient,
+    )
+
+
+def optimised(length=1.0, mass=1.0, time=1.0):
+    """An optimisation that its stop rule ends, in other units, and all designs."""
+    scene = small_scene(
+        steps=20, filter_length=2 / 16, blend_time=0.05, transient=2 * 4e-3, particles_per_cell=3
+    )
+    scene = scaled(scene, length, mass, time)
+    stages = (
+        Stage(0.5, 1e-2, 1e-3, 4e-3 * time),
+        Stage(8.0, 1e-2, 1e-3, 4e-3 * time, solid=True, audited=True, leave_out=0.05),
+    )
+    settings = Settings(stages, window=3, tolerance=1e-4, least_iterations=4, most_iterations=40)
+    designs = []
+    start = Problem(stages[0].scene(scene)).join(0.0, 1.0, -0.3, -0.5)
+    done = optimise(scene, settings, start, [lambda run: designs.append(run.last)])
+    return done, designs
+
+
+def test_a_random_start_is_the_same_in_all_units():
+    scene = small_scene(steps=1)
+    position = Problem(scene).particles.position
+    other = random_start(scaled(scene, 2.0**-9, 2.0, 2.0**5), 3)
+    assert np.array_equal(other(2.0**-9 * position), random_start(scene, 3)(position))
+
+
+@pytest.fixture(scope="module")
+def plain():
+    return optimised()
+
+
+@pytest.mark.parametrize(
+    ("length", "mass", "time"),
+    [
+        (2.0**-9, 1.0, 1.0),
+        (1.0, 2.0**19, 1.0),
+        (1.0, 1.0, 2.0**-7),
+        (2.0**-27, 2.0**30, 2.0**20),
+        (2.0**11, 2.0**-12, 2.0**5),
+    ],
+)
+def test_other_units_lead_to_the_same_steps_bit_for_bit(plain, length, mass, time):
+    (one, designs), (other, others) = plain, optimised(length, mass, time)
+    assert len(one.history) == len(other.history)
+    assert "iterations changed by" in one.stop_reason
+    units = {**dict.fromkeys(LENGTHS, length), "time_step": time}
+    for item, there in zip(designs, others):
+        assert np.array_equal(item.x, there.x)
+        assert np.array_equal(item.gamma, there.gamma)
+        for name, value in item.numbers().items():
+            if name not in ("seconds", "failure"):
+                found = getattr(there, name)
+                assert np.array_equal(units.get(name, 1.0) * value, found, equal_nan=True), name
+    one, two = summarise(one, {}), summarise(other, {})
+    for name in ("start", "reference", "optimised", "post_processed", "post_processed_half_step"):
+        assert two[name] == (None if one[name] is None else length * one[name])
+    assert [two[name] for name in ("gain_kept", "greyness", "a", "theta", "b")] == [
+        one[name] for name in ("gain_kept", "greyness", "a", "theta", "b")
+    ]
+    assert one["post_processed_half_step"] is not None
+
+
+def finished(path, scene):
+    """The run file of a few evaluations of a scene, with what they print, and its summary."""
+    stages = (Stage(4.0, 1e-2, 1e-3, 4e-3, solid=True),)
+    settings = Settings(stages, window=1, least_iterations=10, most_iterations=10, tolerance=0.0)
+    done = optimise(scene, settings, Problem(scene).join(0.0, 1.0, -0.3, -0.5), [ProgressBar()])
+    summary = summarise(done, {})
+    runfile.write(path, done, summary)
+    return summary
+
+
+def are_told(text, count):
+    """All numbers of a text that are not whole: so many, with three significant digits or more."""
+    numbers = re.findall(r"(?<![\w.])-?\d+\.\d+(?:e-\d+)?(?![\w%])", text)
+    assert len(numbers) == count, text
+    for number in numbers:
+        assert len(re.sub(r"e.*|\D", "", number).lstrip("0")) >= 3, text
+
+
+def test_what_is_printed_of_a_small_robot_has_digits(tmp_path, capsys):
+    # Half a millimetre long, in metres.
+    summary = finished(tmp_path / "run.h5", scaled(small_scene(steps=20), 2e-3, 1.0, 1.0))
+    (progress,) = capsys.readouterr().err.splitlines()
+    are_told(re.search(r"L ([^,]+),", progress)[1], 1)
+    lengths = {name: summary[name] for name in ("start", "reference", "optimised", "gain")}
+    are_told(table(lengths), 7)
+    kept = runfile.read(tmp_path / "run.h5")
+    are_told(re.search(r"best L = (\S+)", repr(kept))[1], 1)
+    assert commands.main(["postprocess", str(tmp_path / "run.h5")]) == 0
+    are_told("\n".join(line.split("(gamma")[0] for line in capsys.readouterr().out.split("\n")), 3)
+    assert commands.main(["audit", str(tmp_path / "run.h5")]) == 0
+    _, *lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 4
+    for line in lines:
+        are_told(line.split("16 ")[-1].split("32 ")[-1].split(None, 1)[1], 2)
+
+
+def test_what_is_printed_of_several_small_starts_has_digits():
+    row = {
+        "post_processed": 6.1e-4, "gain": 1.234e-4, "kept_half_step": 1.0, "kept_half_cells": 0.5,
+        "audited_gain": 6e-5, "loose_particles": 0, "failed_evaluations": 0, "seconds": 1.0,
+    }  # fmt: skip
+    text = report([{"start": 0, **row}, {"start": 1, **row, "gain": 1.3e-4, "audited_gain": 5e-5}])
+    lines = text.splitlines()
+    assert len({len(line) for line in lines[:3]}) == 1
+    are_told(text, 6 + 8 + 1)
+
+
+def test_a_body_that_cannot_gain_keeps_no_share_of_it(tmp_path, capsys):
+    body = tuple(part for part in small_scene().body if not isinstance(part, Design))
+    scene = small_scene(steps=20, body=body)
+    finished(tmp_path / "run.h5", scene)
+    capsys.readouterr()
+    assert commands.main(["postprocess", str(tmp_path / "run.h5")]) == 0
+    assert "share of the gain kept   none, there is no gain" in capsys.readouterr().out
