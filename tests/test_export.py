@@ -255,7 +255,7 @@ def read_motion(path):
         frames.append({array.GetName(): vtk_to_numpy(array).copy() for array in arrays})
         cells = vtk_to_numpy(grid.GetCells().GetConnectivityArray()).reshape(-1, 4)
         frames[-1]["corners"] = vtk_to_numpy(grid.GetPoints().GetData())[cells]
-        assert set(vtk_to_numpy(grid.GetCellTypes())) == {9}
+        assert {grid.GetCellType(cell) for cell in range(grid.GetNumberOfCells())} == {9}
     return np.array(times), frames
 
 
