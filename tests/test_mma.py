@@ -845,18 +845,12 @@ def spoiling(function):
     return spoilt
 
 
-HALF = {  # x + y <= 2, or more of it, in every form
-    "buffers": lambda wrap: {
-        "constraints": NonlinearConstraint(
-            wrap(lambda x: [x.sum(), x[0]]), -9, [2, 9], jac=wrap(lambda x: [[1, 1], [1, 0]])
-        )
-    },
-    "differences": lambda wrap: {
-        "constraints": NonlinearConstraint(wrap(lambda x: [x.sum(), x[0]]), -9, [2, 9])
-    },
-    "dict": lambda wrap: {
-        "constraints": {"type": "ineq", "fun": wrap(lambda x: [2 - x[0] - x[1]])}
-    },
+HALF = {  # x + y <= 2.5, or more than that, in every form
+    "vector": lambda wrap: NonlinearConstraint(
+        wrap(lambda x: [x.sum(), x[0]]), -9, [2.5, 9], jac=wrap(lambda x: [[1, 1], [1, 0]])
+    ),
+    "differences": lambda wrap: NonlinearConstraint(wrap(np.sum), -9, 2.5),
+    "dict": lambda wrap: {"type": "ineq", "fun": wrap(lambda x: [2.5 - x[0] - x[1]])},
 }
 
 
@@ -877,10 +871,10 @@ def test_memory_of_the_caller_is_neither_kept_nor_trusted(
         bounds=[(0, 1), (0, 3)],
         globally_convergent=globally_convergent,
         tol=1e-6,
-        **HALF[form](wrap),
+        constraints=HALF[form](wrap),
     )
     assert result.success
-    np.testing.assert_allclose(result.x, [1, 1], atol=1e-5)
+    np.testing.assert_allclose(result.x, [1, 1.5], atol=1e-5)
     assert result.fun == pytest.approx(np.sum((result.x - 2) ** 2), rel=1e-14)
     np.testing.assert_allclose(result.jac, 2 * (result.x - 2), rtol=1e-14)
     kept = result.jac.copy()
@@ -898,7 +892,7 @@ def test_callback_that_changes_what_it_is_given_changes_nothing(by_name):
     def of_x(x):
         x[...] = np.nan
 
-    constraints = LinearConstraint(np.array([[1.0, 1.0]]), -9, 1.5)
+    constraints = LinearConstraint(np.array([[1.0, 1.0]]), -9, 2.5)
     spoilt = solved(constraints=constraints, callback=of_result if by_name else of_x)
     plain = solved(constraints=constraints)
     assert plain.success and spoilt.nit == plain.nit
