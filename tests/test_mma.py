@@ -713,7 +713,7 @@ WILD = st.tuples(
 )
 
 
-@settings(max_examples=15, deadline=None, derandomize=True)
+@settings(max_examples=6, deadline=None, derandomize=True)
 @given(
     wild=st.lists(WILD, min_size=1, max_size=1),
     weights=st.lists(st.floats(-1, 1), min_size=2, max_size=2),
