@@ -42,8 +42,8 @@ GRADIENT_SHARE = 1e-3  # of |df/dx| that both P and Q receive, so that none is z
 ELASTIC_COST = 1e3  # c_i of [3], for functions scaled to gradients of size one
 INNER_ITERATIONS = 30  # of the globally convergent variant; convexity grows up to 10 times in each
 PRECISION = 1e-12  # of the subproblem's solution, relative to the change over one step
-HOPELESS = 1e-8  # a gradient so much smaller than the value meets no constraint
-TINY = 1e-150  # gradients below overflow in quotients
+HOPELESS = 1e-8  # a constraint whose gradient is so much smaller than its value loses weight
+TINY = 1e-150  # gradients below would overflow in quotients
 FADED = 1e-6  # a gradient so much smaller than the largest seen moves x little: raa0
 EPSILON = float(np.finfo(np.float64).eps)
 
@@ -250,8 +250,7 @@ class MovingAsymptotes:
         scale = np.where(seen > 0, seen, 1.0)
         # A constraint is measured by its gradient at x: one seen long ago may be larger by any
         # factor. One that no step within the bounds can meet must not hinder the rest.
-        met = size > np.maximum(HOPELESS * np.abs(values), TINY)
-        scale[1:] = np.where(met, size, scale)[1:]
+        scale[1:] = np.maximum(size, np.maximum(HOPELESS * np.abs(values), TINY))[1:]
 
         all_distances = self._next_distance(x)
         distance = all_distances[free]
@@ -289,10 +288,13 @@ class MovingAsymptotes:
             convexity = np.where(excess > noise, raised, convexity)
 
         # Not counted: what the rounding of x does to g. Without gradient there is no unit.
-        excess = values[1:] - 10 * EPSILON * (np.abs(gradients[1:]) @ np.abs(x))
+        beyond = values[1:] - 10 * EPSILON * (np.abs(gradients[1:]) @ np.abs(x))
+        beyond = np.where(values[1:] > 0, np.maximum(beyond, 0.0), values[1:])
+        moved = float((np.abs(x - self.x_previous)[free] / span).max(initial=0.0))
         with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
-            self.violations = np.where(excess > 0, excess / size[1:], 0.0)
-            optimality = self._optimality(x, below, span, slopes, multipliers, values, scale[0])
+            self.violations = np.where(beyond > 0, beyond / size[1:], 0.0)
+            gap = float((multipliers * np.abs(beyond)).max(initial=0.0))
+            optimality = self._optimality(below, moved, slopes, multipliers, gap, scale[0])
         self.kkt_residual = max(optimality, float(self.violations.max(initial=0.0)))
         self._slopes = slopes
         self.step_size = float((np.abs(x_next - x)[free] / span).max(initial=0.0))
@@ -305,23 +307,20 @@ class MovingAsymptotes:
 
     def _optimality(
         self,
-        x: Array,
         below: Array,
-        span: Array,
+        moved: float,
         slopes: Array,
         multipliers: Array,
-        values: Array,
+        gap: float,
         largest: float,
     ) -> float:
         """Projected gradient and complementarity, in the unit that `MovingAsymptotes` tells."""
         lagrangian = slopes[0] + multipliers @ slopes[1:]
-        gap = float((multipliers * np.abs(values[1:])).max(initial=0.0))
         size = float(np.abs(slopes[0]).max(initial=0.0)) or 1.0
         by_gradient = max(_projected(below, lagrangian / size), gap / size)
         if self._slopes is None:
             return by_gradient
         # The step of Newton's method, with the curvature that the last step showed.
-        moved = float(np.abs((x - self.x_previous)[self.upper > self.lower] / span).max(initial=0))
         before = self._slopes[0] + multipliers @ self._slopes[1:]
         change = float(np.abs(lagrangian - before).max(initial=0.0))
         newton = _projected(below, lagrangian * moved / change) if moved and change else np.inf

@@ -1191,3 +1191,200 @@ def test_evaluate_must_return_a_pair_of_real_numbers():
                 **good_arguments(),
                 evaluate=lambda x: value,  # noqa: B023
             )
+
+
+def test_constants_are_the_published_ones():
+    """Of [3], but the least distance, for which see the test of cycles."""
+    optimiser = MovingAsymptotes([0.0], [1.0])
+    assert optimiser.move_limit == optimiser.asymptote_initial == 0.5
+    assert (optimiser.asymptote_decrease, optimiser.asymptote_increase) == (0.7, 1.2)
+    assert (optimiser.asymptote_min, optimiser.asymptote_max) == (1e-6, 10)
+    assert optimiser.raa0 == 1e-5
+    assert (mma.ASYMPTOTE_MARGIN, mma.GRADIENT_SHARE, mma.ELASTIC_COST) == (0.9, 1e-3, 1e3)
+
+
+def test_distances_stay_within_their_limits():
+    optimiser = MovingAsymptotes([0.0, 0.0], [1.0, 1.0])
+    for k in range(60):  # one goes on, one turns back
+        optimiser.step([0.01 * k, 0.5 + 0.1 * (k % 2)], 0.0, [1.0, 1.0])
+    assert optimiser.asymptote_distance.tolist() == [10, 1e-6]
+
+
+def test_step_keeps_away_from_the_asymptotes():
+    """Nine tenths of the way at most, where neither bound nor move limit is nearer."""
+    optimiser = MovingAsymptotes([0.0], [1.0], asymptote_initial=0.1, raa0=1e-12)
+    assert optimiser.step([0.5], 0.0, [1.0])[0] == pytest.approx(0.5 - 0.9 * 0.1, rel=1e-12)
+
+
+def test_least_convexity_of_the_objective_is_that_of_the_largest_gradient_seen():
+    """And forgotten by reset: the closed form with raa0 times 5, then times 0.01."""
+    optimiser = MovingAsymptotes([0.0], [1.0], raa0=0.1)
+    for k, largest in enumerate((5.0, 5.0, 0.01)):
+        if k == 2:
+            optimiser.reset()
+        slope = 5.0 if k == 0 else 0.01
+        x = optimiser.step([0.5], 0.0, [slope])
+        p, q = 1.001 * slope + 0.1 * largest, 0.001 * slope + 0.1 * largest
+        expected = (np.sqrt(q) - np.sqrt(p)) / (np.sqrt(q) + np.sqrt(p))
+        assert x[0] == pytest.approx(0.5 + 0.5 * expected, rel=1e-12)
+
+
+def trial(slope, convexity):
+    """The first step t in units of the distance, for one variable on [0, 1] at 0.5."""
+    p = max(slope, 0) + 1e-3 * abs(slope) + convexity
+    q = max(-slope, 0) + 1e-3 * abs(slope) + convexity
+    t = np.clip((np.sqrt(q) - np.sqrt(p)) / (np.sqrt(q) + np.sqrt(p)), -0.9, 0.9)
+    return t, 0.5 * (p * t / (1 - t) - q * t / (1 + t))
+
+
+@pytest.mark.parametrize("excess", [0.01, 0.3, 1e9])
+def test_inner_iterations_follow_the_published_rule(excess):
+    """rho is a tenth of the mean slope at first, then min(1.1 (rho + excess / w), 10 rho) [2]."""
+    slope, f, seen = -2.0, 3.0, []
+
+    def evaluate(x):
+        seen.append((x[0] - 0.5) / 0.5)
+        return (f + trial(slope, 0.2)[1] + excess, []) if len(seen) == 1 else (-1e9, [])
+
+    MovingAsymptotes([0.0], [1.0]).step([0.5], f, [slope], evaluate=evaluate)
+    t = trial(slope, 0.2)[0]
+    w = 0.5 * 2 * t**2 / (1 - t**2)
+    expected = trial(slope, min(1.1 * (0.2 + excess / w), 2.0))[0]
+    np.testing.assert_allclose(seen, [t, expected], rtol=1e-12)
+
+
+def test_only_functions_that_lie_below_are_made_more_convex():
+    """A constraint that is far from active has no influence on the step, raised or not."""
+    seen = []
+
+    def evaluate(x):
+        seen.append(x[0])
+        return -1e9, [-4.0 if len(seen) < 4 else -1e9]
+
+    MovingAsymptotes([0.0], [1.0]).step([0.5], 3.0, [-2.0], [-5.0], [[0.1]], evaluate=evaluate)
+    assert len(seen) == 4
+    np.testing.assert_allclose(seen, 0.5 + 0.5 * trial(-2.0, 0.2)[0], rtol=1e-6)
+
+
+@pytest.mark.parametrize(("excess", "calls"), [(5e-15, 1), (5e-14, 2)])
+def test_excess_of_the_size_of_rounding_raises_nothing(excess, calls):
+    """Rounding of f = 3, twice, and of a slope of 2: 10 times 8 times 2.2e-16 = 1.8e-14."""
+    seen = []
+
+    def evaluate(x):
+        seen.append(x)
+        return (3.0 + trial(-2.0, 0.2)[1] + excess, []) if len(seen) == 1 else (-1e9, [])
+
+    MovingAsymptotes([0.0], [1.0]).step([0.5], 3.0, [-2.0], evaluate=evaluate)
+    assert len(seen) == calls
+
+
+def test_multipliers_do_not_depend_on_the_convexity_that_was_added():
+    multipliers = []
+    for excess in (0.0, 10.0):
+        optimiser, left = MovingAsymptotes([0.0, 0.0], [1.0, 1.0]), [excess, excess, 0.0]
+
+        def evaluate(x):
+            more = left.pop(0) if left else 0.0  # noqa: B023
+            return (100.0, [100.0]) if more else (-1e9, [-1e9])
+
+        x = optimiser.step([0.5, 0.5], 1.0, [-2.0, -1.0], [0.0], [[1.0, 1.0]], evaluate=evaluate)
+        assert np.all(np.isfinite(x))
+        multipliers.append(optimiser.multipliers)
+    np.testing.assert_allclose(multipliers[0], multipliers[1], rtol=1e-12)
+    assert multipliers[0][0] > 0.1
+
+
+def test_residual_weighs_an_idle_constraint_by_its_multiplier():
+    """Complementarity: with f' = -1 and one step from the bound of g the multiplier is not 0."""
+    optimiser = MovingAsymptotes([0.0], [1.0])
+    optimiser.step([0.5], 0.0, [-1.0], [-0.1], [[1.0]])
+    # stationary to first order, feasible, but g = -0.1 is not active
+    assert optimiser.multipliers[0] > 0.5
+    assert optimiser.kkt_residual >= 0.1 * optimiser.multipliers[0] * (1 - 1e-12)
+
+
+def test_residual_in_the_unit_of_today_and_of_history():
+    """f = 50 (x - 1/2)^2 on [0, 1]: gradient, last step, distance by the last curvature."""
+    optimiser = MovingAsymptotes([0.0], [1.0])
+    points = [0.9, 0.5 + 1e-3, 0.5 - 1e-5]
+    residuals = []
+    for x in points:
+        optimiser.step([x], 50 * (x - 0.5) ** 2, [100 * (x - 0.5)])
+        residuals.append(optimiser.kkt_residual)
+    # at first the gradient at x is the unit; then the step of 0.399 is far from small, and at
+    # last the gradient is 1e-3 of the largest, 40
+    assert residuals[0] == pytest.approx(0.9)
+    assert residuals[1] == pytest.approx(0.399**2)
+    assert residuals[2] == pytest.approx(1e-3 / 40)
+
+
+def test_residual_after_restore_knows_no_last_step():
+    first = MovingAsymptotes([0.0], [1.0])
+    first.step([0.5 + 1e-5], 0.0, [1e-3])
+    second = MovingAsymptotes([0.0], [1.0])
+    second.step([0.2], 0.0, [1.0])
+    second.restore(first.state())
+    second.step([0.5], 0.0, [1e-9])
+    assert second.kkt_residual == pytest.approx(0.5)  # in units of the gradient at x
+
+
+def test_state_holds_everything_that_the_next_steps_need():
+    """Each entry, changed, changes the steps that follow."""
+    optimiser = MovingAsymptotes(np.zeros(2), np.ones(2), raa0=0.1)
+    for x in ([0.5, 0.5], [0.6, 0.4], [0.55, 0.35]):
+        optimiser.step(x, 0.0, [3.0, 1.0])
+
+    def following(state):
+        other = MovingAsymptotes(np.zeros(2), np.ones(2))
+        other.restore(state)
+        x = other.step([0.57, 0.3], 0.0, [0.2, -0.1])
+        return np.append(x, other.step(0.1 + 0.7 * x, 0.0, [-0.02, 0.05]))
+
+    state = optimiser.state()
+    expected = following(state)
+    changes = {
+        "x_previous": np.array([0.9, 0.1]),
+        "x_before_previous": np.array([0.1, 0.9]),
+        "asymptote_distance": np.array([0.2, 0.2]),
+        "gradient_scale": np.array([30.0]),
+        "iteration": 1,
+        "move_limit": 0.01,
+        "asymptote_initial": 0.3,
+        "asymptote_increase": 2.0,
+        "asymptote_decrease": 0.1,
+        "asymptote_min": 0.9,
+        "asymptote_max": 0.1,
+        "raa0": 1.0,
+    }
+    assert set(changes) | {"lower", "upper"} == set(state)
+    for name, value in changes.items():
+        before = {**state, "iteration": 0} if name == "asymptote_initial" else state
+        more = {"asymptote_max": 1.0} if name == "asymptote_min" else {}
+        more = {"asymptote_min": 1e-9} if name == "asymptote_max" else more
+        reference = following({**before, **more})
+        assert not np.array_equal(following({**before, **more, name: value}), reference), name
+    assert np.array_equal(following(state), expected)
+
+
+def test_reset_forgets_all():
+    """What follows is what a new optimiser does, bit for bit."""
+    used, new = (MovingAsymptotes(np.full(5, 1.0), np.full(5, 10.0)) for _ in range(2))
+    follow(used, cantilever, np.full(5, 5.0), 7)
+    used.reset()
+    x = np.array([2.0, 9.0, 4.0, 3.0, 2.0])
+    assert np.array_equal(follow(used, cantilever, x, 7), follow(new, cantilever, x, 7))
+    assert used.kkt_residual == new.kkt_residual and used.step_size == new.step_size
+
+
+def test_constraint_that_no_step_can_meet_does_not_hinder_the_rest():
+    """One whose slope is 1e13 times smaller than its violation has no say: f decides."""
+    alone, beside = (MovingAsymptotes([0.0], [1.0]) for _ in range(2))
+    x = alone.step([0.5], 0.0, [1.0])
+    for g, slope in ((1.0, 0.0), (0.0, 0.0), (1.0, -1e-13), (1e9, -1e-4)):
+        beside.reset()
+        y = beside.step([0.5], 0.0, [1.0], [g], [[slope]])
+        np.testing.assert_allclose(y, x, atol=0.1)
+    for slope in (-1e-2, -1e-6):  # one that gains from the step goes before f
+        beside.reset()
+        assert beside.step([0.5], 0.0, [1.0], [1.0], [[slope]])[0] > 0.9
