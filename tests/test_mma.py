@@ -1388,3 +1388,50 @@ def test_constraint_that_no_step_can_meet_does_not_hinder_the_rest():
     for slope in (-1e-2, -1e-6):  # one that gains from the step goes before f
         beside.reset()
         assert beside.step([0.5], 0.0, [1.0], [1.0], [[slope]])[0] > 0.9
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_subproblem_knows_the_bounds(side):
+    """What x0 cannot take of a constraint, because of its bound, x1 takes: g~ is used up."""
+    optimiser = MovingAsymptotes([-1.0, -1.0], [1.0, 1.0])
+    x = side * np.array([0.99, 0.1])
+    new = optimiser.step(x, 0.0, [-side * 2.0, -side * 1.0], [-0.1], [[side * 1.0, side * 1.0]])
+    assert new[0] == pytest.approx(side, rel=1e-9)
+    t = side * (new - x)  # the distance of the asymptotes is 0.5 of 2
+    slope = 2.0  # times the range
+    p, q = 1.001 * slope + 1e-5 * slope, 0.001 * slope + 1e-5 * slope
+    assert np.sum(0.5 * (p * t / (1 - t) - q * t / (1 + t))) == pytest.approx(0.1, rel=1e-8)
+
+
+def test_steps_stay_within_the_bounds_to_the_last_bit(rng):
+    for _ in range(200):
+        low = rng.uniform(-1, 1, 3)
+        high = low + 10 ** rng.uniform(-6, 2, 3)
+        optimiser = MovingAsymptotes(low, high, move_limit=1.0, asymptote_initial=1.3)
+        x = low + rng.random(3) * (high - low)
+        new = optimiser.step(np.clip(x, low, high), 0.0, rng.choice([-1, 1], 3) / (high - low))
+        assert np.all(new >= low) and np.all(new <= high)
+
+
+def test_step_of_length_zero_is_not_repeated():
+    seen = []
+
+    def evaluate(x):
+        seen.append(x)
+        return 5.0, []  # above any approximation, although x is the same
+
+    new = MovingAsymptotes([0.0], [1.0]).step([0.0], 0.0, [1.0], evaluate=evaluate)
+    assert new[0] == 0 and len(seen) == 1
+
+
+def test_optimality_counts_the_gap_and_the_curvature_of_the_lagrangian():
+    """The greatest of gradient and gap, in the unit of today; or in that of history if near."""
+    optimiser, below, one = MovingAsymptotes([0.0], [1.0]), np.array([0.5]), np.ones(1)
+    balanced = np.array([[2.0], [-2.0]])
+    assert optimiser._optimality(below, 0.0, balanced, one, 0.3, 2.0) == 0.3 / 2
+    optimiser._slopes = np.array([[3.0], [-2.0]])
+    assert optimiser._optimality(below, 1e-3, balanced, one, 0.3, 10.0) == 0.3 / 10
+    # The gradient of the Lagrangian fell from 0.15 to 0.1 over 0.2: it vanishes 0.4 further on.
+    optimiser._slopes = np.array([[1.0], [-0.85]])
+    far = optimiser._optimality(below, 0.2, np.array([[1.0], [-0.9]]), one, 5.0, 100.0)
+    assert far == pytest.approx(0.4**2)
