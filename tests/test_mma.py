@@ -1204,10 +1204,10 @@ def test_constants_are_the_published_ones():
 
 
 def test_distances_stay_within_their_limits():
-    optimiser = MovingAsymptotes([0.0, 0.0], [1.0, 1.0])
-    for k in range(60):  # one goes on, one turns back
-        optimiser.step([0.01 * k, 0.5 + 0.1 * (k % 2)], 0.0, [1.0, 1.0])
-    assert optimiser.asymptote_distance.tolist() == [10, 1e-6]
+    optimiser = MovingAsymptotes([0.0] * 3, [1.0] * 3)
+    for k in range(60):  # one goes on, one turns back, one stands still
+        optimiser.step([0.01 * k, 0.5 + 0.1 * (k % 2), 0.5], 0.0, [1.0] * 3)
+    assert optimiser.asymptote_distance.tolist() == [10, 1e-6, 0.5]
 
 
 def test_step_keeps_away_from_the_asymptotes():
