@@ -1435,3 +1435,12 @@ def test_optimality_counts_the_gap_and_the_curvature_of_the_lagrangian():
     optimiser._slopes = np.array([[1.0], [-0.85]])
     far = optimiser._optimality(below, 0.2, np.array([[1.0], [-0.9]]), one, 5.0, 100.0)
     assert far == pytest.approx(0.4**2)
+
+
+def test_evaluate_may_overwrite_its_argument():
+    def evaluate(x):
+        x[...] = np.nan
+        return -1e9, []
+
+    new = MovingAsymptotes([0.0], [1.0]).step([0.5], 3.0, [-2.0], evaluate=evaluate)
+    assert new[0] == pytest.approx(0.5 + 0.5 * trial(-2.0, 0.2)[0])
