@@ -1444,3 +1444,11 @@ def test_evaluate_may_overwrite_its_argument():
 
     new = MovingAsymptotes([0.0], [1.0]).step([0.5], 3.0, [-2.0], evaluate=evaluate)
     assert new[0] == pytest.approx(0.5 + 0.5 * trial(-2.0, 0.2)[0])
+
+
+def test_violation_is_measured_by_the_gradient_at_x():
+    optimiser = MovingAsymptotes([0.0], [1.0])
+    optimiser.step([0.9], 0.0, [1.0], [-1.0], [[1e8]])
+    optimiser.step([0.8], 0.0, [1.0], [20.0], [[-1e-2]])
+    assert optimiser.violations[0] == pytest.approx(20 / 1e-2)
+    assert optimiser.kkt_residual == optimiser.violations[0]
