@@ -1451,4 +1451,4 @@ def test_violation_is_measured_by_the_gradient_at_x():
     optimiser.step([0.9], 0.0, [1.0], [-1.0], [[1e8]])
     optimiser.step([0.8], 0.0, [1.0], [20.0], [[-1e-2]])
     assert optimiser.violations[0] == pytest.approx(20 / 1e-2)
-    assert optimiser.kkt_residual == optimiser.violations[0]
+    assert optimiser.kkt_residual >= optimiser.violations[0]
