@@ -20,8 +20,11 @@ Three sources are cited by number:
    the constants, and the elastic variables that keep every subproblem feasible.
 """
 
+import copy
 import inspect
+import reprlib
 from collections.abc import Callable, Iterable, Mapping
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -39,6 +42,9 @@ GRADIENT_SHARE = 1e-3  # of |df/dx| that both P and Q receive, so that none is z
 ELASTIC_COST = 1e3  # c_i of [3], for functions scaled to gradients of size one
 INNER_ITERATIONS = 30  # of the globally convergent variant; convexity grows up to 10 times in each
 PRECISION = 1e-12  # of the subproblem's solution, relative to the change over one step
+HOPELESS = 1e-8  # a constraint whose gradient is so much smaller than its value loses weight
+TINY = 1e-150  # gradients below would overflow in quotients
+FADED = 1e-6  # a gradient so much smaller than the largest seen moves x little: raa0
 EPSILON = float(np.finfo(np.float64).eps)
 
 
@@ -63,17 +69,26 @@ class MovingAsymptotes:
         Least and greatest distance, as fractions of the range. A least distance of 0.01, which
         is often used, can end in cycles of that size.
     raa0 : float
-        Least convexity of the approximations. It is relative to the largest gradient seen since
-        the last reset, so that the iterates do not depend on the scale of f or g.
+        Least convexity of the approximations. It is relative to the largest gradient of f seen
+        since the last reset, and to that of g_i at x, so that the iterates do not depend on the
+        scale of f or g.
 
     Attributes
     ----------
     multipliers : ndarray, shape (m,)
         Lagrange multipliers (>= 0) of the last subproblem.
+    violations : ndarray, shape (m,)
+        Violations of the constraints at the x of the last step, in units of the largest gradient
+        entry of each *at that x* times range: about the fraction of a range to a feasible point.
+        Infinite where a violated constraint has no gradient.
     kkt_residual : float
         How far the x of the last step was from a Karush-Kuhn-Tucker point: the greatest of
-        projected gradient of the Lagrangian, violation and complementarity. Dimensionless:
-        x is measured in ranges, f and g_i in units of their largest gradient entry times range.
+        projected gradient of the Lagrangian, violations, and complementarity (multiplier times
+        value). Dimensionless: x is measured in ranges, and the first and the third, which have
+        the unit of f, by the largest gradient entry of f at x times range. At a minimum within
+        the bounds that gradient vanishes: there the measure is the largest seen since the last
+        reset, and the squares of the last step and of the distance to the minimum that the
+        curvature over this step tells must not be larger either.
     step_size : float
         Greatest change of a variable in the last step, as a fraction of its range.
 
@@ -117,8 +132,10 @@ class MovingAsymptotes:
 
     def _check_parameters(self) -> None:
         for name in PARAMETERS:
-            if not 0 < getattr(self, name) < np.inf:
-                raise MMAError(f"{name} is {getattr(self, name)}: it must be positive and finite")
+            value = getattr(self, name)
+            number = isinstance(value, Real)
+            if not (number and 0 < value < np.inf):
+                raise MMAError(f"{name} is {value!r}: it must be a positive finite number")
         if not self.asymptote_decrease <= 1 <= self.asymptote_increase:
             raise MMAError(
                 f"asymptote_decrease, asymptote_increase are {self.asymptote_decrease}, "
@@ -137,6 +154,8 @@ class MovingAsymptotes:
         self.asymptote_distance = np.full(self.lower.size, self.asymptote_initial)
         self.gradient_scale: Array = np.zeros(0)
         self.multipliers: Array = np.zeros(0)
+        self.violations: Array = np.zeros(0)
+        self._slopes: Array | None = None  # of the last step; only the residual needs them
         self.kkt_residual = np.inf
         self.step_size = np.inf
 
@@ -165,6 +184,7 @@ class MovingAsymptotes:
         for name in PARAMETERS:
             setattr(self, name, float(state[name]))
         self.iteration = int(state["iteration"])
+        self._slopes = None
 
     def step(
         self,
@@ -207,13 +227,7 @@ class MovingAsymptotes:
         self._check_parameters()
         n = self.lower.size
         x = _checked("x", x, (n,), "start from a finite x")
-        outside = np.maximum(self.lower - x, x - self.upper)
-        if np.any(outside > 0):
-            j = int(np.argmax(outside))
-            raise MMAError(
-                f"x[{j}] = {x[j]} is outside its bounds [{self.lower[j]}, {self.upper[j]}]: "
-                "clip x to the bounds"
-            )
+        self._refuse_outside("x", x)
         if (g is None) != (dgdx is None):
             raise MMAError("g and dgdx belong together: pass both or none")
         if g is None or dgdx is None:
@@ -234,6 +248,9 @@ class MovingAsymptotes:
         size = np.abs(slopes).max(axis=1, initial=0.0)
         seen = np.maximum(self.gradient_scale, size) if self.iteration else size
         scale = np.where(seen > 0, seen, 1.0)
+        # A constraint is measured by its gradient at x: one seen long ago may be larger by any
+        # factor. One that no step within the bounds can meet must not hinder the rest.
+        scale[1:] = np.maximum(size, np.maximum(HOPELESS * np.abs(values), TINY))[1:]
 
         all_distances = self._next_distance(x)
         distance = all_distances[free]
@@ -242,8 +259,7 @@ class MovingAsymptotes:
         low = -np.minimum(limit, below / distance)
         high = np.minimum(limit, above / distance)
         # Violating a constraint must cost more than its multiplier, which is about df / dg.
-        # A constraint without gradient cannot be met by any step and must not hinder the rest.
-        cost = ELASTIC_COST * scale[0] / np.where(size > 1e-8 * scale, size, scale)[1:]
+        cost = ELASTIC_COST * scale[0] / scale[1:]
 
         convexity = self.raa0 * scale
         if evaluate is not None:  # the starting value of [3]
@@ -261,7 +277,7 @@ class MovingAsymptotes:
             x_next = np.clip(x_next, self.lower, self.upper)
             if evaluate is None:
                 break
-            actual = _checked_values(*evaluate(x_next.copy()), m)
+            actual = _checked_values(*_pair("evaluate", evaluate(x_next.copy())), m)
             excess = actual - (values + rise @ (t / (1 - t)) - fall @ (t / (1 + t)))
             noise = 10 * EPSILON * (np.abs(values) + np.abs(actual) + np.abs(slopes).sum(axis=1))
             growth = float(distance @ (2 * t**2 / (1 - t**2)))  # df~/d convexity
@@ -271,14 +287,16 @@ class MovingAsymptotes:
             raised = np.minimum(1.1 * (convexity + excess / growth), 10 * convexity)
             convexity = np.where(excess > noise, raised, convexity)
 
-        gradient = (slopes[0] + multipliers @ slopes[1:]) / scale[0]
-        self.kkt_residual = float(
-            max(
-                np.abs(below - np.clip(below - gradient, 0.0, 1.0)).max(initial=0.0),
-                (values[1:] / scale[1:]).max(initial=0.0),
-                (multipliers * np.abs(values[1:])).max(initial=0.0) / scale[0],
-            )
-        )
+        # Not counted: what the rounding of x does to g. Without gradient there is no unit.
+        beyond = values[1:] - 10 * EPSILON * (np.abs(gradients[1:]) @ np.abs(x))
+        beyond = np.where(values[1:] > 0, np.maximum(beyond, 0.0), values[1:])
+        moved = float((np.abs(x - self.x_previous)[free] / span).max(initial=0.0))
+        with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
+            self.violations = np.where(beyond > 0, beyond / size[1:], 0.0)
+            gap = float((multipliers * np.abs(beyond)).max(initial=0.0))
+            optimality = self._optimality(below, moved, slopes, multipliers, gap, scale[0])
+        self.kkt_residual = max(optimality, float(self.violations.max(initial=0.0)))
+        self._slopes = slopes
         self.step_size = float((np.abs(x_next - x)[free] / span).max(initial=0.0))
         self.multipliers = multipliers
         self.gradient_scale = seen
@@ -286,6 +304,37 @@ class MovingAsymptotes:
         self.x_before_previous, self.x_previous = self.x_previous, x
         self.iteration += 1
         return x_next
+
+    def _optimality(
+        self,
+        below: Array,
+        moved: float,
+        slopes: Array,
+        multipliers: Array,
+        gap: float,
+        largest: float,
+    ) -> float:
+        """Projected gradient and complementarity, in the unit that `MovingAsymptotes` tells."""
+        lagrangian = slopes[0] + multipliers @ slopes[1:]
+        size = float(np.abs(slopes[0]).max(initial=0.0)) or 1.0
+        by_gradient = max(_projected(below, lagrangian / size), gap / size)
+        if self._slopes is None:
+            return by_gradient
+        # The step of Newton's method, with the curvature that the last step showed.
+        before = self._slopes[0] + multipliers @ self._slopes[1:]
+        change = float(np.abs(lagrangian - before).max(initial=0.0))
+        newton = _projected(below, lagrangian * moved / change) if moved and change else np.inf
+        by_largest = max(_projected(below, lagrangian / largest), gap / largest)
+        return min(by_gradient, max(by_largest, moved**2, newton**2))
+
+    def _refuse_outside(self, name: str, x: Array) -> None:
+        outside = np.maximum(self.lower - x, x - self.upper)
+        if np.any(outside > 0):
+            j = int(np.argmax(outside))
+            raise MMAError(
+                f"{name}[{j}] = {x[j]} is outside its bounds [{self.lower[j]}, {self.upper[j]}]: "
+                f"clip {name} to the bounds"
+            )
 
     def _next_distance(self, x: Array) -> Array:
         """Distances of the asymptotes from x as fractions of the range, rule of [3]."""
@@ -320,7 +369,7 @@ REJECT = "reject this point, and go back to the last good one with half the move
 
 def _checked(name: str, value: npt.ArrayLike, shape: tuple[int, ...], cure: str) -> Array:
     """A new float array of that shape, or the named error."""
-    array = np.array(value, dtype=np.float64)
+    array = _real(name, value)
     if array.shape != shape:
         raise MMAError(f"{name} has shape {array.shape} where {shape} is needed")
     if not np.all(np.isfinite(array)):
@@ -328,6 +377,24 @@ def _checked(name: str, value: npt.ArrayLike, shape: tuple[int, ...], cure: str)
         where = str(list(j)) if j else ""
         raise MMAError(f"{name}{where} is {array[j]}: {cure}")
     return array
+
+
+def _projected(below: Array, gradient: Array) -> float:
+    """Greatest step against the gradient that the bounds 0 and 1 leave at `below`."""
+    return float(np.abs(below - np.clip(below - gradient, 0.0, 1.0)).max(initial=0.0))
+
+
+def _real(name: str, value: Any) -> Array:
+    """A new float array. NumPy would drop imaginary parts, and make NaN of None."""
+    try:
+        array = np.array(value)
+        if array.dtype.kind == "O":  # of numbers that NumPy does not know
+            array = np.array([float(v) for v in array.flat]).reshape(array.shape)
+        if array.dtype.kind not in "biuf":
+            raise TypeError
+    except (TypeError, ValueError):
+        raise MMAError(f"{name} is {reprlib.repr(value)}: pass real numbers") from None
+    return array.astype(np.float64)
 
 
 def _checked_values(f: float, g: npt.ArrayLike, m: int) -> Array:
@@ -441,86 +508,219 @@ def _solve_subproblem(
 class _Rows:
     """A constraint of scipy.optimize as rows g(x) <= 0: lower limits first, then upper."""
 
-    def __init__(self, constraint: Any, x0: Array, lower: Array, upper: Array) -> None:
+    def __init__(self, name: str, constraint: Any, x0: Array, lower: Array, upper: Array) -> None:
+        self.name, self.lower, self.upper = name, lower, upper
         self.jac: Any = "2-point"
         self.rel_step: Any = None
         limits: tuple[Any, Any]
         if isinstance(constraint, LinearConstraint):
-            matrix = _dense(constraint.A)
-            self.fun: Callable[[Array], Any] = lambda x: matrix @ x
+            matrix = np.atleast_2d(_dense(f"the matrix of {name}", constraint.A))
+            if matrix.shape[1] != x0.size:
+                raise MMAError(
+                    f"the matrix of {name} has shape {matrix.shape}, but there are {x0.size} "
+                    "variables: give it one column for each"
+                )
+            self.fun: Any = lambda x: matrix @ x
             self.jac = lambda x: matrix
             limits = constraint.lb, constraint.ub
         elif isinstance(constraint, NonlinearConstraint):
-            self.fun = constraint.fun
-            self.jac = constraint.jac
+            self.fun, self.jac = constraint.fun, constraint.jac
             self.rel_step = constraint.finite_diff_rel_step
             limits = constraint.lb, constraint.ub
         elif isinstance(constraint, Mapping) and "type" in constraint and "fun" in constraint:
-            kind = str(constraint["type"]).lower()
-            if kind not in ("ineq", "eq"):
-                raise MMAError(f"constraint type {constraint['type']!r}: 'ineq' is what there is")
-            args = constraint.get("args", ())
-            function, derivative = constraint["fun"], constraint.get("jac")
-            self.fun = lambda x: function(x, *args)
-            if callable(derivative):
-                self.jac = lambda x: derivative(x, *args)
-            elif derivative:
-                self.jac = derivative
-            limits = 0.0, (np.inf if kind == "ineq" else 0.0)
+            self.fun, self.jac, upper_limit = self._of_mapping(constraint)
+            limits = 0.0, upper_limit
         else:
             raise MMAError(
-                f"constraint {constraint!r}: pass a LinearConstraint, a NonlinearConstraint, or "
-                "a dict with 'type': 'ineq' and 'fun'"
+                f"{name} is {reprlib.repr(constraint)}: pass a LinearConstraint, a "
+                "NonlinearConstraint, or a dict with 'type': 'ineq' and 'fun'"
             )
-        if not callable(self.jac) and self.jac not in ("2-point", "3-point", "cs"):
-            raise MMAError(f"constraint jac {self.jac!r}: pass a callable or '2-point'")
-        m = np.asarray(self.fun(x0.copy())).size
-        self.low, self.high = (np.broadcast_to(np.asarray(v, dtype=float), (m,)) for v in limits)
-        if np.any(self.low >= self.high):
+        if np.any(getattr(constraint, "keep_feasible", False)):
             raise MMAError(
-                "the limits of a constraint are equal or reversed, but moving asymptotes need "
-                "inequalities: eliminate a variable, or widen the limits to a tolerance"
+                f"{name} has keep_feasible=True, but moving asymptotes may violate a constraint "
+                "on their way: leave it out, and let the functions stand such points"
+            )
+        if not callable(self.fun):
+            raise MMAError(f"the fun of {name} is {self.fun!r}: pass a callable")
+        if not (callable(self.jac) or str(self.jac) in ("2-point", "3-point", "cs")):
+            raise MMAError(
+                f"the jac of {name} is {reprlib.repr(self.jac)}: pass a callable, or '2-point', "
+                "'3-point' or 'cs'"
+            )
+        self.size = np.size(self.fun(x0.copy()))
+        self.components(x0)  # refuses what is no vector
+        self.low, self.high = (
+            _spread(f"the {side} limit of {name}", value, self.size, "components")
+            for side, value in zip(("lower", "upper"), limits, strict=True)
+        )
+        if np.any(self.low >= self.high):
+            i = int(np.argmax(self.low >= self.high))
+            raise MMAError(
+                f"the limits {self.low[i]}, {self.high[i]} of {name}[{i}] are equal or reversed, "
+                "but moving asymptotes need inequalities: eliminate a variable, or widen the "
+                "limits to a tolerance"
             )
         self.has_low, self.has_high = np.isfinite(self.low), np.isfinite(self.high)
-        # Finite differences stay within the bounds; a fixed variable has no room for that.
-        fixed = lower == upper
-        self.box = np.where(fixed, -np.inf, lower), np.where(fixed, np.inf, upper)
+        self.count = int(np.sum(self.has_low) + np.sum(self.has_high))
+
+    def _of_mapping(self, constraint: Mapping[str, Any]) -> tuple[Any, Any, float]:
+        """Its function, Jacobian matrix and upper limit."""
+        kind = str(constraint["type"]).lower()
+        if kind not in ("ineq", "eq"):
+            raise MMAError(
+                f"the type of {self.name} is {constraint['type']!r}: 'ineq' is what there is"
+            )
+        unknown = sorted(str(key) for key in set(constraint) - {"type", "fun", "jac", "args"})
+        if unknown:
+            raise MMAError(
+                f"{self.name} has the unknown key {', '.join(unknown)}: the keys are type, fun, "
+                "jac, args"
+            )
+        args = constraint.get("args", ())
+        if not isinstance(args, tuple | list):
+            raise MMAError(f"the args of {self.name} are {reprlib.repr(args)}: pass a tuple")
+        function: Any = constraint["fun"]
+        derivative: Any = constraint.get("jac")
+        if not callable(function):
+            raise MMAError(f"the fun of {self.name} is {function!r}: pass a callable")
+
+        def differentiated(x: Array) -> Any:
+            return derivative(x, *args)
+
+        jac: Any = differentiated if callable(derivative) else derivative
+        jac = "2-point" if jac is None or jac is False else jac
+        return lambda x: function(x, *args), jac, np.inf if kind == "ineq" else 0.0
+
+    def components(self, x: Array) -> Array:
+        """The values of its function, one for each component."""
+        values = np.atleast_1d(_real(f"the value of {self.name}", self.fun(x.copy())))
+        if values.shape != (self.size,):
+            raise MMAError(
+                f"the value of {self.name} has shape {values.shape} where ({self.size},) is "
+                "needed: return a vector, of the same length everywhere"
+            )
+        if not np.all(np.isfinite(values)):
+            i = int(np.argmin(np.isfinite(values)))
+            raise MMAError(
+                f"{self.name}[{i}] is {values[i]} at x = {reprlib.repr(x.tolist())}: give bounds "
+                "within which it is finite"
+            )
+        return values
 
     def value(self, x: Array) -> Array:
-        c = np.ravel(self.fun(x.copy()))
+        c = self.components(x)
         return np.append((self.low - c)[self.has_low], (c - self.high)[self.has_high])
 
     def jacobian(self, x: Array) -> Array:
-        if callable(self.jac):
-            matrix = self.jac(x.copy())
-        else:
-            matrix = approx_derivative(
-                self.fun, x, method=self.jac, rel_step=self.rel_step, bounds=self.box
-            )
-        matrix = np.reshape(_dense(matrix), (self.low.size, x.size))
+        name, m, n = f"the Jacobian matrix of {self.name}", self.size, x.size
+        matrix = self._differences(x) if not callable(self.jac) else self.jac(x.copy())
+        matrix = _dense(name, matrix)
+        # A vector is one row, or one column, where it cannot be anything else.
+        if matrix.ndim < 2 and 1 in (m, n) and matrix.size == m * n:
+            matrix = matrix.reshape(m, n)
+        if matrix.shape != (m, n):
+            hint = "transpose it" if matrix.shape == (n, m) else "one row for each component"
+            raise MMAError(f"{name} has shape {matrix.shape} where {m, n} is needed: {hint}")
+        if not np.all(np.isfinite(matrix)):
+            i, j = (int(k) for k in np.argwhere(~np.isfinite(matrix))[0])
+            raise MMAError(f"{name} is {matrix[i, j]} at [{i}, {j}]: {REJECT}")
         return np.vstack([-matrix[self.has_low], matrix[self.has_high]])
 
+    def _differences(self, x: Array) -> Array:
+        """By finite differences within the bounds; a fixed variable, which has no room, has 0."""
+        free = self.lower < self.upper
 
-def _dense(matrix: Any) -> Array:
-    return np.asarray(matrix.toarray() if hasattr(matrix, "toarray") else matrix, dtype=float)
+        def function(part: Any) -> Any:
+            whole = x.astype(part.dtype)
+            whole[free] = part
+            return np.atleast_1d(np.array(self.fun(whole)))  # a copy: it may be a buffer
+
+        matrix = np.zeros((self.size, x.size))
+        if np.any(free) and self.size:
+            step = self.rel_step
+            matrix[:, free] = approx_derivative(
+                function,
+                x[free],
+                method=self.jac,
+                rel_step=step if step is None or np.ndim(step) == 0 else np.asarray(step)[free],
+                bounds=(self.lower[free], self.upper[free]),
+            )
+        return matrix
+
+    def violated(self, row: int, amount: float) -> str:
+        """Which limit the row is, and that it is violated by that amount."""
+        lower = np.flatnonzero(self.has_low)
+        if row < lower.size:
+            i, side, limit = lower[row], "lower", self.low
+        else:
+            i, side, limit = np.flatnonzero(self.has_high)[row - lower.size], "upper", self.high
+        return f"{self.name}[{i}] violates its {side} limit {limit[i]:g} by {amount:.6g}"
+
+
+def _dense(name: str, matrix: Any) -> Array:
+    return _real(name, matrix.toarray() if hasattr(matrix, "toarray") else matrix)
+
+
+def _pair(name: str, value: Any) -> tuple[Any, Any]:
+    """The first two, as scipy.optimize takes them."""
+    try:
+        return value[0], value[1]
+    except (TypeError, IndexError, KeyError):
+        raise MMAError(f"{name} gave {reprlib.repr(value)}: it must return a pair") from None
+
+
+def _spread(name: str, value: Any, n: int, what: str) -> Array:
+    """A number, or one for each of the n."""
+    array = _real(name, value)
+    if array.shape not in ((), (1,), (n,)):
+        raise MMAError(f"{name} has shape {array.shape}, but there are {n} {what}: give it ({n},)")
+    if np.any(np.isnan(array)):
+        i = int(np.argmax(np.isnan(array))) if array.size > 1 else 0
+        raise MMAError(f"{name} is nan at [{i}]: leave out a limit with inf")
+    return np.broadcast_to(array, (n,)).copy()
+
+
+def _bounds(bounds: Any, n: int) -> tuple[Array, Array]:
+    """Lower and upper, from any form that scipy.optimize takes."""
+    if isinstance(bounds, Bounds):
+        return (
+            _spread("the lower bound", bounds.lb, n, "variables"),
+            _spread("the upper bound", bounds.ub, n, "variables"),
+        )
+    try:
+        pairs = [(low, high) for low, high in bounds]
+    except (TypeError, ValueError):
+        raise MMAError(
+            f"bounds are {reprlib.repr(bounds)}: pass Bounds, or a pair (lower, upper) for each "
+            "variable"
+        ) from None
+    if len(pairs) != n:
+        raise MMAError(f"{len(pairs)} pairs of bounds for {n} variables: give one for each")
+    lower = [-np.inf if low is None else low for low, _ in pairs]
+    upper = [np.inf if high is None else high for _, high in pairs]
+    return _real("the lower bound", lower), _real("the upper bound", upper)
 
 
 class _Problem:
-    """f, g and their gradients; the last point's values are kept."""
+    """f, g and their gradients; the last point's values are kept, as copies."""
 
     def __init__(self, fun: Any, jac: Any, args: tuple[Any, ...], rows: list[_Rows]) -> None:
         self.fun, self.jac, self.args, self.rows = fun, jac, args, rows
         self.nfev = self.njev = 0
         self.x: Array | None = None
 
-    def values(self, x: Array) -> tuple[Any, Array]:
+    def values(self, x: Array) -> tuple[float, Array]:
         if self.x is None or not np.array_equal(x, self.x):
             self.nfev += 1
             f = self.fun(x.copy(), *self.args)
             if self.jac is True:
                 self.njev += 1
-                f, self.gradient = f
-            self.f = np.squeeze(f)
+                f, gradient = _pair("fun", f)
+                self.gradient = self._gradient(gradient, x.size)
+            value = _real("the value of fun", f)
+            if value.size != 1:
+                raise MMAError(f"the value of fun has shape {value.shape}: return one number")
+            self.f = float(value.item())
             self.g = np.concatenate([np.zeros(0), *(r.value(x) for r in self.rows)])
             self.x = x.copy()
         return self.f, self.g
@@ -528,15 +728,20 @@ class _Problem:
     def gradients(self, x: Array) -> tuple[Array, Array]:
         if self.jac is not True:
             self.njev += 1
-            self.gradient = self.jac(x.copy(), *self.args)
+            self.gradient = self._gradient(self.jac(x.copy(), *self.args), x.size)
         dgdx = np.vstack([np.zeros((0, x.size)), *(r.jacobian(x) for r in self.rows)])
-        return np.asarray(self.gradient), dgdx
+        return self.gradient, dgdx
+
+    @staticmethod
+    def _gradient(value: Any, n: int) -> Array:
+        gradient = np.atleast_1d(_real("the gradient", value))
+        return _checked("the gradient", gradient, (n,), REJECT)
 
 
 def minimize(
     fun: Callable[..., Any],
     x0: npt.ArrayLike,
-    args: tuple[Any, ...] = (),
+    args: Any = (),
     jac: Callable[..., Any] | bool | None = None,
     bounds: Bounds | Iterable[tuple[float, float]] | None = None,
     constraints: Any = (),
@@ -546,6 +751,7 @@ def minimize(
     hessp: None = None,
     maxiter: int = 200,
     tol: float = 1e-8,
+    disp: bool = False,
     globally_convergent: bool = False,
     **parameters: float,
 ) -> OptimizeResult:
@@ -559,25 +765,29 @@ def minimize(
     fun : callable
         ``fun(x, *args) -> float``, or ``-> (float, gradient)`` if jac is True.
     x0 : array_like, shape (n,)
-        Start, within the bounds. It may violate the constraints.
+        Start, within the bounds up to rounding. It may violate the constraints.
     args : tuple, optional
-        Passed on to fun and jac.
+        Passed on to fun and jac. Anything else is taken for the only argument.
     jac : callable or True
         ``jac(x, *args) -> ndarray, shape (n,)``, the gradient.
     bounds : scipy.optimize.Bounds or sequence of (lower, upper)
-        All finite.
+        All finite. No function is evaluated outside.
     constraints : LinearConstraint, NonlinearConstraint, dict, or a list of these
         In the conventions of scipy.optimize; inequalities only. Their Jacobian matrices are
         found by finite differences where none is given.
     callback : callable, optional
-        ``callback(x)`` or ``callback(intermediate_result=...)`` after each iteration. It stops
-        the search by raising StopIteration.
+        ``callback(x)`` or ``callback(intermediate_result=...)`` after each iteration, with
+        copies. It stops the search by raising StopIteration.
     hess, hessp : None
-        Not used by this method.
+        Not used by this method, nor is the Hessian of a NonlinearConstraint.
     maxiter : int
         Greatest number of iterations.
     tol : float
-        Stop when the KKT residual (see `MovingAsymptotes`) is at most this.
+        Stop when the KKT residual (see `MovingAsymptotes`) is at most this. Success then means
+        in particular that no constraint is violated by more than tol times its largest gradient
+        entry times range at x.
+    disp : bool
+        Print the message at the end.
     globally_convergent : bool
         Take only steps on which the approximations lie above the functions [2].
     **parameters
@@ -601,27 +811,46 @@ def minimize(
     """
     unknown = sorted(set(parameters) - set(PARAMETERS))
     if unknown:
-        known = ", ".join(("maxiter", "tol", "globally_convergent", *PARAMETERS))
+        known = ", ".join(("maxiter", "tol", "disp", "globally_convergent", *PARAMETERS))
         raise MMAError(f"unknown option {', '.join(unknown)}: the options are {known}")
     if hess is not None or hessp is not None:
         raise MMAError("moving asymptotes use no Hessian: leave hess and hessp out")
+    if not callable(fun):
+        raise MMAError(f"fun is {reprlib.repr(fun)}: pass a callable")
     if not (callable(jac) or jac is True):
-        raise MMAError("jac is missing: pass the gradient, or jac=True if fun returns both")
+        raise MMAError(
+            "jac is missing: pass the gradient, or jac=True if fun returns both; there are no "
+            "finite differences of fun"
+        )
+    if not (callback is None or callable(callback)):
+        raise MMAError(f"callback is {reprlib.repr(callback)}: pass a callable")
     if bounds is None:
         raise MMAError("bounds are missing: give every variable finite bounds")
-    x = np.atleast_1d(np.array(x0, dtype=np.float64))
-    if isinstance(bounds, Bounds):
-        lower, upper = (np.broadcast_to(b, x.shape) for b in (bounds.lb, bounds.ub))
-    else:
-        lower, upper = np.array(list(bounds), dtype=float).reshape(-1, 2).T
-    mma = MovingAsymptotes(lower, upper, **parameters)
+    for name, value in (("maxiter", maxiter), ("tol", tol)):
+        number = isinstance(value, Real)
+        if not (number and value >= 0):
+            raise MMAError(f"{name} is {value!r}: it must be a number, at least 0")
+    x = np.atleast_1d(_real("x0", x0))
+    if x.ndim > 1:
+        raise MMAError(f"x0 has shape {x.shape}: it must have one dimension")
+    x = _checked("x0", x, x.shape, "start from finite values")
+    mma = MovingAsymptotes(*_bounds(bounds, x.size), **parameters)
+    # Rounding may put a start on a bound just outside it; further out is a mistake.
+    rounding = 4 * EPSILON * np.maximum(np.abs(mma.lower), np.abs(mma.upper))
+    inside = np.clip(x, mma.lower, mma.upper)
+    x = np.where(np.abs(x - inside) <= rounding, inside, x)
+    mma._refuse_outside("x0", x)
     if isinstance(constraints, LinearConstraint | NonlinearConstraint | Mapping):
         constraints = [constraints]
-    rows = [_Rows(c, x, mma.lower, mma.upper) for c in constraints or ()]
-    problem = _Problem(fun, jac, args, rows)
-    by_name = callback is not None and set(inspect.signature(callback).parameters) == {
-        "intermediate_result"
-    }
+    try:
+        constraints = [] if constraints is None else list(constraints)
+    except TypeError:
+        constraints = [constraints]  # refused by the next line
+    rows = [
+        _Rows(f"constraints[{k}]", c, x, mma.lower, mma.upper) for k, c in enumerate(constraints)
+    ]
+    problem = _Problem(fun, jac, args if isinstance(args, tuple) else (args,), rows)
+    by_name = callback is not None and _takes_result(callback)
 
     nit = 0
     while True:
@@ -630,7 +859,7 @@ def minimize(
         evaluate = problem.values if globally_convergent else None
         x_next = mma.step(x, f, dfdx, g, dgdx, evaluate)
         result: Any = OptimizeResult()
-        result.update(x=x, fun=float(f), jac=dfdx, maxcv=float(g.max(initial=0.0)), nit=nit)
+        result.update(x=x, fun=f, jac=dfdx, maxcv=float(g.max(initial=0.0)), nit=nit)
         result.update(nfev=problem.nfev, njev=problem.njev, multipliers=mma.multipliers)
         result.update(kkt_residual=mma.kkt_residual, step_size=mma.step_size)
         residual = f"KKT residual {mma.kkt_residual:.2e}"
@@ -638,27 +867,57 @@ def minimize(
         if callback is not None and nit:
             try:
                 if by_name:
-                    callback(intermediate_result=result)
+                    callback(intermediate_result=copy.deepcopy(result))
                 else:
                     callback(x.copy())
             except StopIteration:
                 interrupted = True
         status, message = -1, ""
+        trouble = _trouble(mma, rows, g, dfdx, tol)
+        at_end = f"{residual}. {trouble}".rstrip()
         if mma.kkt_residual <= tol:
             status, message = 0, f"Converged: the {residual} is at most tol = {tol:g}."
         elif interrupted:
-            status, message = 3, f"Stopped by the callback with {residual}."
+            status, message = 3, f"Stopped by the callback with {at_end}"
         elif mma.step_size <= 1e-4 * tol:
+            status = 2
             message = (
                 f"Stalled: the step fell to {mma.step_size:.2e} of the range, but the {residual} "
-                f"is above tol = {tol:g}. Check the gradients, and that the constraints can be "
-                f"met (greatest violation {result.maxcv:.2e})."
+                f"is above tol = {tol:g}. {trouble or 'Check the gradients.'}"
             )
-            status = 2
         elif nit >= maxiter:
-            status, message = 1, f"Stopped after maxiter = {maxiter} iterations with {residual}."
+            status, message = 1, f"Stopped after maxiter = {maxiter} iterations with {at_end}"
         if message:
             result.update(status=status, message=message, success=status == 0)
+            if disp:
+                print(message)
             return result
         x = x_next
         nit += 1
+
+
+def _trouble(mma: MovingAsymptotes, rows: list[_Rows], g: Array, dfdx: Array, tol: float) -> str:
+    """What a search that did not converge should be told about its last x."""
+    row = int(np.argmax(mma.violations)) if g.size else 0
+    if g.size and mma.violations[row] > tol:
+        amount, owner = float(g[row]), iter(rows)
+        while row >= (rows_of := next(owner)).count:
+            row -= rows_of.count
+        return (
+            f"{rows_of.violated(row, amount)}: see whether it can be met within the bounds and "
+            "the other constraints, and check its gradient."
+        )
+    slope = float(np.abs(dfdx * (mma.upper - mma.lower)).max(initial=0.0))
+    if 0 < slope < FADED * mma.gradient_scale[0]:
+        return (
+            f"The gradient fell to {slope / mma.gradient_scale[0]:.0e} of the largest on the way, "
+            "which holds the steps back: start again from this x."
+        )
+    return ""
+
+
+def _takes_result(callback: Callable[..., Any]) -> bool:
+    try:
+        return set(inspect.signature(callback).parameters) == {"intermediate_result"}
+    except (TypeError, ValueError):  # some built-in functions have no signature
+        return False
