@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from mpmopt import runfile
 from mpmopt.binary import Drawing
-from mpmopt.case import RESULTS, Case, run
+from mpmopt.case import RESULTS, Case, draw_or_warn, run
 from mpmopt.errors import RunFileError, SweepError
 from mpmopt.files import locked, make_folder, refuse_foreign, replace_file
 from mpmopt.optimize import Settings
@@ -177,7 +177,7 @@ def multistart(
         raise SweepError(f"no start came to an end\n{failed}")
     plain = [{name.replace("_", " "): value for name, value in row.items()} for row in rows]
     replace_file(table, as_csv(plain, digits=4).encode())
-    draw(picture, out, rows)
+    draw_or_warn(picture, lambda path: draw(path, out, rows))
     return failed + report(rows)
 
 
@@ -236,7 +236,14 @@ def report(rows: Sequence[dict[str, Any]]) -> str:
 
 def draw(path: Path, out: Path, rows: Sequence[dict[str, Any]]) -> None:
     """Write a PNG: gains by start, and the designs, the best first, as far as there is room."""
-    from mpmopt.draw import draw_design, new_figure, png
+    from mpmopt.draw import own_style
+
+    with own_style():
+        _draw(path, out, rows)
+
+
+def _draw(path: Path, out: Path, rows: Sequence[dict[str, Any]]) -> None:
+    from mpmopt.draw import digits, draw_design, new_figure, png
 
     ranked = sorted(rows, key=_rank, reverse=True)
     shown = ranked[:8]
@@ -265,13 +272,14 @@ def draw(path: Path, out: Path, rows: Sequence[dict[str, Any]]) -> None:
     axes.set_ylabel("gain over the full block")
     axes.legend(fontsize=8, ncols=4, loc="lower center", bbox_to_anchor=(0.5, 1.0), frameon=False)
     axes.grid(True, axis="y", alpha=0.3)
+    form = digits([row["audited_gain"] for row in shown])
     for axis, row in zip(lower.subplots(lines, 4, squeeze=False).flat, shown):
         try:
             kept = runfile.read(out / f"start-{row['start']}" / "run.h5")
             draw_design(axis, kept.problem(), kept.best)
         except RunFileError as error:
             logger.warning("no picture of start %d's design: %s", row["start"], error)
-        axis.set_title(f"start {row['start']}: {row['audited_gain']:.3f}", fontsize=9)
+        axis.set_title(f"start {row['start']}: {row['audited_gain']:{form}}", fontsize=9)
     for axis in lower.axes:
         axis.set_axis_off()
     replace_file(path, png(figure))
