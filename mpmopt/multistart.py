@@ -83,7 +83,9 @@ def one_start(
     case = Case(Scene.from_json(scene), Settings.from_dict(settings), drawing, start)
     folder = out / f"start-{seed}"
     folder.mkdir(parents=True, exist_ok=True)
-    with (folder / "log.txt").open("a", buffering=1) as log, contextlib.redirect_stderr(log):
+    # Paths may hold what is no text.
+    log = (folder / "log.txt").open("a", buffering=1, encoding="utf-8", errors="backslashreplace")
+    with log, contextlib.redirect_stderr(log):
         summary = run(case, folder, phi=random_start(case.scene, seed) if seed else None)
 
     def number(value: float | None) -> float:

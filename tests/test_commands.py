@@ -6,6 +6,7 @@ import importlib
 import os
 import re
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -164,6 +165,19 @@ def test_a_reader_that_goes_away_is_an_error_in_a_line(short_path):
     )  # fmt: skip
     os.close(writer)
     assert (done.returncode, done.stderr) == (1, "BrokenPipeError: [Errno 32] Broken pipe\n")
+
+
+def test_a_path_that_standard_output_cannot_say_is_escaped(short_path, tmp_path):
+    folder = tmp_path / os.fsdecode(b"gr\xc3\xbcn\xff")
+    folder.mkdir()
+    shutil.copy(short_path, folder / "run.h5")
+    done = subprocess.run(
+        [sys.executable, "-m", "mpmopt", "export", folder / "run.h5", "--svg", "--width", "60"],
+        capture_output=True, text=True, timeout=120, cwd=ROOT,
+        env={**os.environ, "PYTHONIOENCODING": "ascii:strict", "PYTHONUTF8": "1"},
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (0, "")
+    assert f"{tmp_path}/gr\\xfcn\\udcff/design.svg  " in done.stdout
 
 
 STOPPED = """
