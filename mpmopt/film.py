@@ -83,7 +83,8 @@ class Screen:
         tall = min(shape * (wide - 12), 1.5 * ABOVE) + label
         width = columns * wide
         height = round(rows * tall + head + 6)
-        figure = new_figure(width / DPI, height / DPI)
+        hair = 1e-6 / DPI  # so that no pixel is lost where matplotlib rounds down
+        figure = new_figure(width / DPI + hair, height / DPI + hair)
         figure.set_layout_engine("none")
         figure.set_dpi(DPI)
         self.panels = []

@@ -42,8 +42,8 @@ class Progress:
         self._bar = tqdm(
             total=total, unit=f" {unit}", disable=not shown, leave=False, file=self._stream
         )
-        # Also for one that an error ends before it is closed.
-        self._restore = weakref.finalize(self, _above_bars().close if shown else lambda: None)
+        shown_until = _above(self._bar, self._stream) if shown else ExitStack()
+        self._end = weakref.finalize(self, shown_until.close)  # also after an error
 
     def __enter__(self) -> Progress:
         return self
@@ -65,8 +65,7 @@ class Progress:
 
     def close(self) -> None:
         """Remove the bar."""
-        self._bar.close()
-        self._restore()
+        self._end()
 
     def print(self, line: str) -> None:
         """Print a line of results on standard output, above the bar."""
@@ -93,14 +92,20 @@ class _AboveBars:
             tqdm.write(lines, file=self._stream)
         return len(text)
 
+    def end(self) -> None:
+        """Write what is begun."""
+        self._stream.write(self._begun)
 
-def _above_bars() -> ExitStack:
-    """Write lines on standard error above all bars, until this is closed."""
+
+def _above(bar: tqdm, terminal: TextIO) -> ExitStack:
+    """Write lines on standard error above a bar, until both are closed by this."""
     undo = ExitStack()
-    stream: Any = _AboveBars(sys.stderr)
+    stream: Any = _AboveBars(terminal)
+    undo.callback(stream.end)
     for logger in (logging.getLogger(), logging.getLogger("mpmopt")):
         for handler in logger.handlers:
-            if isinstance(handler, logging.StreamHandler) and handler.stream is sys.stderr:
+            if isinstance(handler, logging.StreamHandler) and handler.stream is terminal:
                 undo.callback(handler.setStream, handler.setStream(stream))
     undo.enter_context(redirect_stderr(stream))
+    undo.callback(bar.close)
     return undo

@@ -107,6 +107,8 @@ def work():
         logging.getLogger("mpmopt.some").warning("logged %d", k)
         warnings.warn(f"warned {{k}}")
         print("printed", k, file=sys.stderr)
+    print("in ", end="", file=sys.stderr)
+    print("parts", file=sys.stderr)
     {end}
 code = reported(work, lambda: "Advice.")
 logging.getLogger("mpmopt.some").warning("the end")
@@ -130,6 +132,7 @@ def test_no_line_of_a_terminal_holds_a_bar_and_something_else(setup, end):
         for k in range(3)
         for line in (f"logged {k}", f"<string>:13: UserWarning: warned {k}", f"printed {k}")
     ]
+    wanted.append("in parts")
     if code:
         wanted.append("StorageError: no room")
     assert lines == [*wanted, "the end"]
