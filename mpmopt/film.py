@@ -108,7 +108,7 @@ class Screen:
             self._labels.append(
                 axes.annotate(
                     "", (0.0, 1.0), xytext=(0, 4), xycoords="axes fraction",
-                    textcoords="offset points", animated=True, fontsize=10,
+                    textcoords="offset points", animated=True, fontsize=8,
                 )
             )  # fmt: skip
         self._clock = figure.text(
