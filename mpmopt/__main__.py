@@ -192,7 +192,7 @@ def resume(path: Path) -> int:
 
 
 def export(path: Path, out: Path | None, force: bool, **options: Any) -> int:
-    """Write a run's best design as files that other programs read, and print what was written."""
+    """Write a run's best design as files that other programs read; 1 if one cannot be written."""
     from mpmopt import runfile
     from mpmopt.export import FILES, size
     from mpmopt.export import export as exported
@@ -213,7 +213,7 @@ def export(path: Path, out: Path | None, force: bool, **options: Any) -> int:
     if done.loose:
         left = "left out" if options["drop_loose"] else "still there: --drop-loose leaves them out"
         print(f"{done.loose} particles hang on nothing, {left}")
-    return 0
+    return 1 if done.failed else 0
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -302,8 +302,8 @@ def _go_on(
     summary = summarise(result, kept.drawing)
     text = json.dumps(summary, indent=1) + "\n"
     replace_file(path.parent / "summary.json", text.encode())
-    _draw(path.parent, result)
     runfile.write(path, result, summary, kept.drawing)
+    _draw(path.parent, result)
     return summary
 
 
@@ -377,11 +377,28 @@ def _number_or_none(value: float) -> float | None:
 
 
 def _draw(out: Path, result: Optimisation) -> None:
-    from mpmopt import plot
-    from mpmopt.motion import optimised
+    def design(path: Path) -> None:
+        from mpmopt.motion import optimised
+        from mpmopt.plot import plot_motion
 
-    plot.plot_motion(out / "design.png", optimised(result.problem(), result.result.x))
-    plot.plot_history(out / "history.png", result)
+        plot_motion(path, optimised(result.problem(), result.result.x))
+
+    def history(path: Path) -> None:
+        from mpmopt.plot import plot_history
+
+        plot_history(path, result)
+
+    draw_or_warn(out / "design.png", design)
+    draw_or_warn(out / "history.png", history)
+
+
+def draw_or_warn(path: Path, draw: Callable[[Path], None]) -> None:
+    """Draw a picture of what is saved; one that fails is a warning of one line."""
+    try:
+        draw(path)
+    except Exception as error:
+        reason = (str(error).splitlines() or [""])[0]
+        logger.warning("no %s: %s: %s", path.name, type(error).__name__, reason)
 
 
 def table(summary: Mapping[str, Any]) -> str:

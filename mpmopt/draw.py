@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from io import BytesIO
 from typing import Any
 
 import numpy as np
+from matplotlib import rc_context, rcdefaults
 from matplotlib.axes import Axes
 from matplotlib.backend_bases import RendererBase
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -15,7 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.path import Path as Outline
 from matplotlib.transforms import Affine2D
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from mpmopt.files import MARK
 from mpmopt.history import Optimisation
@@ -31,6 +34,18 @@ OVERLAP = 1.15
 FAINTEST = 0.02
 
 
+@contextmanager
+def own_style() -> Iterator[None]:
+    """Draw with matplotlib's defaults, whatever the settings outside are.
+
+    A figure is made and saved within this: some settings count when a part is made, others when it
+    is drawn. Also a decorator: ``@own_style()``.
+    """
+    with rc_context():
+        rcdefaults()
+        yield
+
+
 def new_figure(width: float, height: float) -> Figure:
     """An empty figure, in inches."""
     figure = Figure(figsize=(width, height), layout="tight")
@@ -38,11 +53,28 @@ def new_figure(width: float, height: float) -> Figure:
     return figure
 
 
+@own_style()
 def png(figure: Figure, dpi: int = 120) -> bytes:
     """A figure as the content of a PNG file."""
     content = BytesIO()
     figure.savefig(content, format="png", dpi=dpi, metadata={"Comment": MARK})
     return content.getvalue()
+
+
+def format_of(values: ArrayLike) -> str:
+    """A format for numbers of any unit that tells them apart: three digits of their range.
+
+    Times from 0 to 0.16 have three digits after the point, lengths around 2e-6 an exponent. Numbers
+    that hardly differ have six digits.
+    """
+    there = np.asarray(values, dtype=float)
+    there = there[np.isfinite(there)]
+    largest = np.abs(there).max(initial=0.0)
+    if largest == 0.0:
+        return ".3g"
+    before = math.floor(math.log10(largest))
+    after = 2 - math.floor(math.log10(max(np.ptp(there), 1e-3 * largest)))
+    return f".{max(after, 0)}f" if after <= 6 and before <= 6 else f".{before + after + 1}g"
 
 
 def wall_lines(scene: Scene) -> list[tuple[Wall, float]]:

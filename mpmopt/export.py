@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable, Sequence
+import logging
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -14,12 +15,14 @@ from numpy.typing import NDArray
 
 from mpmopt.binary import THRESHOLD, kept, pieces
 from mpmopt.checks import number
-from mpmopt.errors import ExportError, MissingLibraryError
+from mpmopt.errors import ExportError, MissingLibraryError, MpmoptError, StorageError
 from mpmopt.files import make_folder, replace_file
 from mpmopt.motion import Motion, equal_steps, solid
 from mpmopt.outline import Polygon, outline
 from mpmopt.problem import Problem
 from mpmopt.vtkhdf import content
+
+logger = logging.getLogger(__name__)
 
 FILES = {"svg": "design.svg", "dxf": "design.dxf", "stl": "design.stl", "vtk": "motion.vtkhdf"}
 EXTRAS = {"dxf": "ezdxf", "stl": "manifold3d"}
@@ -39,11 +42,14 @@ class Exported:
         In millimetres; empty if only the motion was written.
     loose : int
         Particles of the whole body that hang on nothing (`binary.pieces`).
+    failed : tuple of str
+        Formats that could not be written; a warning says why.
     """
 
     paths: tuple[Path, ...]
     polygons: list[Polygon]
     loose: int
+    failed: tuple[str, ...] = ()
 
 
 def export(
@@ -61,7 +67,7 @@ def export(
     """Write a design without grey, as drawing, solid and motion, into a folder.
 
     Particles with gamma >= threshold and the regions that are not designed are there, as in
-    `binary.post_processed`.
+    `binary.post_processed`. What cannot be written is warned of, and the rest is written.
 
     Parameters
     ----------
@@ -88,10 +94,12 @@ def export(
         written then.
     MissingLibraryError
         If ezdxf or manifold3d is needed and not installed; nothing is written then.
-    DesignError, SimulationError
-        If x or the threshold does not fit, or the body without void cannot be simulated.
+    DesignError
+        If x or the threshold does not fit.
+    SimulationError
+        If only the motion is asked for, and the body without void cannot be simulated.
     StorageError
-        If a file cannot be written.
+        If the folder, or no file, can be written.
     """
     formats = list(formats)
     unknown = [name for name in formats if name not in FILES]
@@ -111,22 +119,48 @@ def export(
     if drop_loose:
         keep &= ~loose
     polygons: list[Polygon] = []
-    contents: dict[str, bytes] = {}
+    writers: dict[str, Callable[[], bytes]] = {}
     if drawn:
         polygons = in_millimetres(outline(problem, x, threshold, keep), width, scale)
         if thickness is None:
             thickness = 0.1 * size(polygons)[0]
-        writers = {"svg": svg, "dxf": dxf, "stl": lambda sized: stl(sized, thickness)}
-        contents = {name: writers[name](polygons) for name in writers if name in formats}
-    if "vtk" in formats:
+        if "stl" in formats:
+            _check_length("thickness", thickness)
+        writers = {
+            "svg": lambda: svg(polygons),
+            "dxf": lambda: dxf(polygons),
+            "stl": lambda: stl(polygons, thickness),
+        }
+
+    def motion() -> bytes:
         frames = np.unique(equal_steps(problem.scene, FRAMES))
-        contents["vtk"] = content(Motion.of(solid("design", problem, x, keep), frames))
-    make_folder(out)
+        return content(Motion.of(solid("design", problem, x, keep), frames))
+
+    writers["vtk"] = motion
+    for name in EXTRAS.keys() & formats:
+        _extra(name)
+    contents: dict[str, bytes] = {}
+    failed: dict[str, MpmoptError] = {}
+    for name in (name for name in writers if name in formats):
+        try:
+            contents[name] = writers[name]()
+        except MpmoptError as error:
+            failed[name] = error
+    if contents:
+        make_folder(out)
+    paths = []
     for name, written in contents.items():
-        replace_file(out / FILES[name], written)
-    paths = tuple(out / FILES[name] for name in contents)
+        try:
+            replace_file(out / FILES[name], written)
+            paths.append(out / FILES[name])
+        except StorageError as error:
+            failed[name] = error
+    if not paths:
+        raise next(iter(failed.values()))
+    for name, reason in failed.items():
+        logger.warning("no %s: %s", FILES[name], reason)
     halves = 1 if problem.scene.mirror is None else 2
-    return Exported(paths, polygons, halves * int(loose.sum()))
+    return Exported(tuple(paths), polygons, halves * int(loose.sum()), tuple(failed))
 
 
 def size(polygons: Sequence[Polygon]) -> NDArray[np.float64]:

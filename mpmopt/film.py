@@ -17,7 +17,17 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from numpy.typing import NDArray
 from PIL import Image
 
-from mpmopt.draw import BLUE, RED, Squares, draw_walls, new_figure, set_view, view
+from mpmopt.draw import (
+    BLUE,
+    RED,
+    Squares,
+    draw_walls,
+    format_of,
+    new_figure,
+    own_style,
+    set_view,
+    view,
+)
 from mpmopt.errors import DesignError, MissingLibraryError, SimulationError, StorageError
 from mpmopt.files import MARK, replace_file
 from mpmopt.motion import Motion, equal_steps, optimised, post_processed, reference
@@ -62,6 +72,7 @@ class Screen:
     panels : list of matplotlib Axes
     """
 
+    @own_style()
     def __init__(self, motions: Sequence[Motion], slow: float) -> None:
         self._motions, self._slow = motions, slow
         box = view(motions)
@@ -71,8 +82,9 @@ class Screen:
         label, head = 24, 30  # pixels above each panel and at the top
         tall = min(shape * (wide - 12), 1.5 * ABOVE) + label
         width = columns * wide
-        height = 2 * round((rows * tall + head + 6) / 2)  # even, as MP4 needs
-        figure = new_figure(width / DPI, height / DPI)
+        height = round(rows * tall + head + 6)
+        hair = 1e-6 / DPI  # so that no pixel is lost where matplotlib rounds down
+        figure = new_figure(width / DPI + hair, height / DPI + hair)
         figure.set_layout_engine("none")
         figure.set_dpi(DPI)
         self.panels = []
@@ -96,7 +108,7 @@ class Screen:
             self._labels.append(
                 axes.annotate(
                     "", (0.0, 1.0), xytext=(0, 4), xycoords="axes fraction",
-                    textcoords="offset points", animated=True, fontsize=10,
+                    textcoords="offset points", animated=True, fontsize=8,
                 )
             )  # fmt: skip
         self._clock = figure.text(
@@ -112,18 +124,22 @@ class Screen:
         """Number of frames."""
         return len(self._motions[0].frames)
 
+    @own_style()
     def frame(self, number: int) -> NDArray[np.uint8]:
         """One frame as colours (height, width, 3), from the top."""
         first = self._motions[0]
-        time = first.frames[number] * first.scene.time_step
-        self._clock.set_text(f"t = {time:.3f}     {self._slow:.3g} times slower")
+        times = first.frames * first.scene.time_step
+        self._clock.set_text(
+            f"t = {times[number]:{format_of(times)}}     {self._slow:.3g} times slower"
+        )
+        form = format_of([motion.objective for motion in self._motions])
         self._canvas.restore_region(self._empty)
         self._figure.draw_artist(self._clock)
         for motion, axes, squares, label in zip(
             self._motions, self.panels, self._squares, self._labels
         ):
             squares.show(number)
-            label.set_text(f"{motion.name}: L = {motion.objective[number]:.3f}")
+            label.set_text(f"{motion.name}: L = {motion.objective[number]:{form}}")
             axes.draw_artist(squares)
             axes.draw_artist(label)
         return np.array(self._canvas.buffer_rgba())[..., :3]
@@ -155,7 +171,7 @@ class Filmed:
         gait = f", {self.per_period:.0f} frames per period of the actuation"
         return (
             f"{self.frames} frames, {self.seconds:.1f} s, {self.slow:.3g} times slower"
-            f"{gait if self.per_period else ''}, {self.bytes / 1e6:.1f} MB"
+            f"{gait if self.per_period else ''}, {self.bytes / 1e6:.3g} MB"
         )
 
 
@@ -275,6 +291,7 @@ def _mp4(frames: Iterator[NDArray[np.uint8]]) -> bytes:
         command = [
             _ffmpeg(), "-v", "error", "-f", "rawvideo", "-pix_fmt", "rgb24",
             "-s", f"{width}x{height}", "-r", str(RATE), "-i", "-", "-an", "-c:v", "libx264",
+            "-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2:color=white",  # sizes that yuv420p can have
             "-pix_fmt", "yuv420p", "-crf", "20", "-movflags", "+faststart",
             "-metadata", f"comment={MARK}", str(path),
         ]  # fmt: skip
@@ -296,5 +313,6 @@ def _mp4(frames: Iterator[NDArray[np.uint8]]) -> bytes:
                     process.stdin.close()
                 process.wait()
         if process.returncode != 0:
-            raise StorageError(f"ffmpeg ended with {process.returncode}: {log.read_text().strip()}")
+            said = log.read_bytes().decode(errors="replace").strip()
+            raise StorageError(f"ffmpeg ended with {process.returncode}: {said}")
         return path.read_bytes()

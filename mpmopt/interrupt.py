@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import shlex
 import signal
@@ -105,6 +106,7 @@ def reported(work: Callable[[], int | None], advice: Callable[[], str]) -> int:
     """Do a command's work, or say in a line on standard error why it ended.
 
     Where standard output has no reader, or there is no memory or no disk, that is said too.
+    Characters that standard output cannot have are escaped.
 
     Parameters
     ----------
@@ -118,6 +120,8 @@ def reported(work: Callable[[], int | None], advice: Callable[[], str]) -> int:
     int
         Exit code: the work's, 1 after an error, or 128 and the number of a signal.
     """
+    if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
+        sys.stdout.reconfigure(errors="backslashreplace")
     try:
         with interruptible(advice):
             code = work() or 0

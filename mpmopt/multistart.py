@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from mpmopt import runfile
 from mpmopt.binary import Drawing
-from mpmopt.case import RESULTS, Case, drawn, run
+from mpmopt.case import RESULTS, Case, draw_or_warn, drawn, run
 from mpmopt.checks import count, digits, instance, place
 from mpmopt.errors import RunFileError, SweepError
 from mpmopt.files import locked, make_folder, refuse_foreign, replace_file
@@ -85,7 +85,9 @@ def one_start(
     case = Case(Scene.from_json(scene), Settings.from_dict(settings), drawing, start)
     folder = out / f"start-{seed}"
     folder.mkdir(parents=True, exist_ok=True)
-    with (folder / "log.txt").open("a", buffering=1) as log, contextlib.redirect_stderr(log):
+    # Paths may hold what is no text.
+    log = (folder / "log.txt").open("a", buffering=1, encoding="utf-8", errors="backslashreplace")
+    with log, contextlib.redirect_stderr(log):
         summary = run(case, folder, phi=random_start(case.scene, seed) if seed else None)
 
     def number(value: float | None) -> float:
@@ -187,7 +189,7 @@ def multistart(
         raise SweepError(f"no start came to an end\n{failed}")
     plain = [{name.replace("_", " "): value for name, value in row.items()} for row in rows]
     replace_file(table, as_csv(plain, digits=4).encode())
-    draw(picture, out, rows)
+    draw_or_warn(picture, lambda path: draw(path, out, rows))
     return failed + report(rows)
 
 
@@ -251,7 +253,14 @@ def _length(value: float) -> str:
 
 def draw(path: Path, out: Path, rows: Sequence[dict[str, Any]]) -> None:
     """Write a PNG: gains by start, and the designs, the best first, as far as there is room."""
-    from mpmopt.draw import draw_design, new_figure, png
+    from mpmopt.draw import own_style
+
+    with own_style():
+        _draw(path, out, rows)
+
+
+def _draw(path: Path, out: Path, rows: Sequence[dict[str, Any]]) -> None:
+    from mpmopt.draw import draw_design, format_of, new_figure, png
 
     ranked = sorted(rows, key=_rank, reverse=True)
     shown = ranked[:8]
@@ -280,13 +289,14 @@ def draw(path: Path, out: Path, rows: Sequence[dict[str, Any]]) -> None:
     axes.set_ylabel("gain over the full block")
     axes.legend(fontsize=8, ncols=4, loc="lower center", bbox_to_anchor=(0.5, 1.0), frameon=False)
     axes.grid(True, axis="y", alpha=0.3)
+    form = format_of([row["audited_gain"] for row in shown])
     for axis, row in zip(lower.subplots(lines, 4, squeeze=False).flat, shown):
         try:
             kept = runfile.read(out / f"start-{row['start']}" / "run.h5")
             draw_design(axis, kept.problem(), kept.best)
         except RunFileError as error:
             logger.warning("no picture of start %d's design: %s", row["start"], error)
-        axis.set_title(f"start {row['start']}: {_length(row['audited_gain'])}", fontsize=9)
+        axis.set_title(f"start {row['start']}: {row['audited_gain']:{form}}", fontsize=9)
     for axis in lower.axes:
         axis.set_axis_off()
     replace_file(path, png(figure))

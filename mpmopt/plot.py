@@ -13,7 +13,9 @@ from mpmopt.draw import (
     draw_design,
     draw_history,
     draw_walls,
+    format_of,
     new_figure,
+    own_style,
     png,
     set_view,
     view,
@@ -28,6 +30,7 @@ from mpmopt.schematic import schematic
 logger = logging.getLogger(__name__)
 
 
+@own_style()
 def plot_motion(path: Path, body: Body, pictures: int = 8) -> None:
     """Write a PNG of a body at equal intervals from start to end.
 
@@ -52,19 +55,21 @@ def plot_motion(path: Path, body: Body, pictures: int = 8) -> None:
     rows = -(-pictures // columns)
     figure = new_figure(wide * columns, (wide * height / width + 0.35) * rows + 0.4)
     name = body.name[0].upper() + body.name[1:]
-    figure.suptitle(f"{name}, L = {motion.objective[-1]:.3f}")
+    figure.suptitle(f"{name}, L = {motion.objective[-1]:{format_of(motion.objective)}}")
     panels = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).ravel()
     for axes in panels[pictures:]:
         axes.set_axis_off()
-    for number, (frame, axes) in enumerate(zip(motion.frames, panels)):
+    times = motion.frames * motion.scene.time_step
+    for number, (time, axes) in enumerate(zip(times, panels)):
         set_view(axes, box)
         draw_walls(axes, motion.scene, moving=True)
         axes.add_collection(Squares(motion, number), autolim=False)
-        axes.set_title(f"t = {frame * motion.scene.time_step:.2f}", fontsize=9)
+        axes.set_title(f"t = {time:{format_of(times)}}", fontsize=9)
         axes.tick_params(labelsize=7)
     replace_file(path, png(figure))
 
 
+@own_style()
 def plot_history(path: Path, run: Optimisation) -> None:
     """Write a PNG of objective, beta and greyness over a run's evaluations, stages marked.
 
@@ -80,6 +85,7 @@ def plot_history(path: Path, run: Optimisation) -> None:
     replace_file(path, png(figure))
 
 
+@own_style()
 def overview(run: Optimisation) -> Figure:
     """A figure of a run's best design before it moves, beside the history that led to it."""
     figure = new_figure(12.0, 4.0)

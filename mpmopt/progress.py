@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import logging
 import sys
 import time
+import weakref
+from contextlib import ExitStack, redirect_stderr
+from typing import Any, TextIO
 
 from tqdm import tqdm
 
@@ -14,6 +18,8 @@ LINES = 10  # of a work whose size is known; of another, one in so many steps
 
 class Progress:
     """A bar that shows steps of work; off a terminal, a line now and then.
+
+    While there is a bar, log lines and what else goes to standard error are written above it.
 
     Parameters
     ----------
@@ -31,8 +37,13 @@ class Progress:
     def __init__(self, unit: str, total: int | None = None) -> None:
         self._unit, self._total, self.count = unit, total, 0
         self._began = time.monotonic()
-        shown = sys.stderr is not None and sys.stderr.isatty()
-        self._bar = tqdm(total=total, unit=f" {unit}", disable=not shown, leave=False)
+        self._stream = sys.stderr
+        shown = self._stream is not None and self._stream.isatty()
+        self._bar = tqdm(
+            total=total, unit=f" {unit}", disable=not shown, leave=False, file=self._stream
+        )
+        shown_until = _above(self._bar, self._stream) if shown else ExitStack()
+        self._end = weakref.finalize(self, shown_until.close)  # also after an error
 
     def __enter__(self) -> Progress:
         return self
@@ -54,12 +65,47 @@ class Progress:
 
     def close(self) -> None:
         """Remove the bar."""
-        self._bar.close()
+        self._end()
 
     def print(self, line: str) -> None:
         """Print a line of results on standard output, above the bar."""
-        with self._bar.external_write_mode(sys.stdout):
+        with self._bar.external_write_mode(self._stream):
             print(line, flush=True)
 
     def _every(self) -> int:
         return max(1, self._total // LINES) if self._total else LINES
+
+
+class _AboveBars:
+    """A stream to a terminal on which whole lines are written above all bars."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream, self._begun = stream, ""
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def write(self, text: str) -> int:
+        """Write the lines that end in the text, and keep what is begun."""
+        lines, end, self._begun = (self._begun + text).rpartition("\n")
+        if end:
+            tqdm.write(lines, file=self._stream)
+        return len(text)
+
+    def end(self) -> None:
+        """Write what is begun."""
+        self._stream.write(self._begun)
+
+
+def _above(bar: tqdm, terminal: TextIO) -> ExitStack:
+    """Write lines on standard error above a bar, until both are closed by this."""
+    undo = ExitStack()
+    stream: Any = _AboveBars(terminal)
+    undo.callback(stream.end)
+    for logger in (logging.getLogger(), logging.getLogger("mpmopt")):
+        for handler in logger.handlers:
+            if isinstance(handler, logging.StreamHandler) and handler.stream is terminal:
+                undo.callback(handler.setStream, handler.setStream(stream))
+    undo.enter_context(redirect_stderr(stream))
+    undo.callback(bar.close)
+    return undo

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Rectangle
 from numpy.typing import NDArray
 
-from mpmopt.draw import draw_walls, new_figure, set_view, wall_lines
+from mpmopt.draw import draw_walls, new_figure, own_style, set_view, wall_lines
 from mpmopt.scene import Actuator, Design, Region, Scene, Solid
 
 FACES: dict[type[Region], str] = {Design: "0.93", Actuator: "#f2b8ad", Solid: "0.55"}
@@ -20,6 +20,7 @@ HATCHES: dict[type[Region], str] = {Design: "..", Actuator: "xx", Solid: ""}
 MOST_INTERVALS = 8
 
 
+@own_style()
 def schematic(scene: Scene) -> Figure:
     """A figure of a scene: what is designed, what squeezes, where it stands and shall go.
 
@@ -41,7 +42,9 @@ def schematic(scene: Scene) -> Figure:
     for number, region in enumerate(scene.body):
         _draw_region(axes, scene, region, number)
     for k in (0, 1):
-        _draw_lengths(axes, np.unique(np.round(corners[:, :, k], 12)), box, k, sides[1 - k], gap)
+        # But for rounding: edges that meet are one.
+        edges = np.unique(np.round(corners[:, :, k] / scene.grid.dx, 6)) * scene.grid.dx
+        _draw_lengths(axes, edges, box, k, sides[1 - k], gap)
     _draw_arrows(axes, scene, box, ahead, gap)
     _label_walls(axes, scene, seen)
     if scene.mirror is not None:

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from walker import CASES, slanted_legs, walker
 
-from mpmopt import runfile
+from mpmopt import plot, runfile
 from mpmopt.case import START, Case, ProgressBar, main, resume, run
 from mpmopt.errors import DesignError, RunFileError, StorageError
 from mpmopt.files import MARK
@@ -135,6 +135,30 @@ def test_a_run_of_another_case_is_never_overwritten(folder):
     with pytest.raises(StorageError, match="earlier run of another case"):
         run(other, out)
     assert (out / "run.h5").read_bytes() == before
+
+
+@pytest.mark.parametrize("how", ["the picture fails", "matplotlib cannot be imported"])
+def test_a_picture_that_fails_spoils_no_run(tmp_path, caplog, monkeypatch, how):
+    def fails(path, body):
+        raise RuntimeError("latex was not able to process the string\nwith a log\nof many lines")
+
+    with monkeypatch.context() as patch:
+        if how == "the picture fails":
+            patch.setattr(plot, "plot_motion", fails)
+        else:
+            patch.setitem(sys.modules, "mpmopt.plot", None)
+        summary = run(TINY, tmp_path)
+    first, *others = (message for message in caplog.messages if "png" in message)
+    if how == "the picture fails":
+        assert first == "no design.png: RuntimeError: latex was not able to process the string"
+        assert not others and (tmp_path / "history.png").exists()
+    else:
+        assert first.startswith("no design.png: ModuleNotFoundError: ")
+        assert len(others) == 1
+    assert not (tmp_path / "design.png").exists()
+    assert json.loads((tmp_path / "summary.json").read_text()) == summary
+    assert runfile.read(tmp_path / "run.h5").summary == summary
+    assert run(TINY, tmp_path) == resume(tmp_path / "run.h5") == summary
 
 
 def test_a_start_is_filled_up_and_knows_its_names():

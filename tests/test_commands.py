@@ -2,10 +2,11 @@
 
 import argparse
 import configparser
-import importlib
+import importlib.util
 import os
 import re
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -73,6 +74,35 @@ def test_the_installed_command_is_this_one():
     module, function = target.split(":")
     assert name == PARSER.prog
     assert getattr(importlib.import_module(module), function) is commands.main
+
+
+HOW = """
+from setuptools import Distribution
+package = Distribution()
+package.parse_config_files(["setup.cfg"])
+install = package.get_command_obj("editable_wheel")
+install.ensure_finalized()
+print(type(install._select_strategy("mpmopt", "", "")).__name__)
+"""
+
+
+def test_an_editable_install_is_an_entry_of_the_path():
+    """A finder would come too late in the folder above a clone: to Python that is a package."""
+    if importlib.util.find_spec("setuptools") is None:
+        pytest.skip("needs setuptools")
+    done = subprocess.run(
+        [sys.executable, "-c", HOW], capture_output=True, text=True, timeout=120, cwd=ROOT
+    )
+    assert done.stdout == "_StaticPth\n", done.stderr
+
+
+def test_a_folder_of_the_packages_name_does_not_hide_it(tmp_path):
+    (tmp_path / "mpmopt" / "docs").mkdir(parents=True)
+    done = subprocess.run(
+        [sys.executable, "-m", "mpmopt", "--version"], capture_output=True, text=True, timeout=120,
+        cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )  # fmt: skip
+    assert (done.returncode, done.stdout) == (0, f"mpmopt {mpmopt.__version__}\n")
 
 
 def test_exit_codes_are_those_of_the_help(tmp_path, monkeypatch, capsys):
@@ -164,6 +194,19 @@ def test_a_reader_that_goes_away_is_an_error_in_a_line(short_path):
     )  # fmt: skip
     os.close(writer)
     assert (done.returncode, done.stderr) == (1, "BrokenPipeError: [Errno 32] Broken pipe\n")
+
+
+def test_a_path_that_standard_output_cannot_say_is_escaped(short_path, tmp_path):
+    folder = tmp_path / os.fsdecode(b"gr\xc3\xbcn\xff")
+    folder.mkdir()
+    shutil.copy(short_path, folder / "run.h5")
+    done = subprocess.run(
+        [sys.executable, "-m", "mpmopt", "export", folder / "run.h5", "--svg", "--width", "60"],
+        capture_output=True, text=True, timeout=120, cwd=ROOT,
+        env={**os.environ, "PYTHONIOENCODING": "ascii:strict", "PYTHONUTF8": "1"},
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (0, "")
+    assert f"{tmp_path}/gr\\xfcn\\udcff/design.svg  " in done.stdout
 
 
 STOPPED = """

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from conftest import small_scene
 
-from mpmopt.draw import BLUE, RED, Squares, draw_walls, new_figure, set_view
+from mpmopt.draw import BLUE, RED, Squares, draw_walls, format_of, new_figure, set_view
 from mpmopt.motion import Motion, optimised, reference
 from mpmopt.problem import Problem
 from mpmopt.scene import Grid, Scene, Solid, Wall
@@ -134,3 +134,24 @@ def test_walls_are_drawn_where_bodies_rest_on_them(place, side, gravity):
     (wall,) = axes.patches
     line = wall.get_y() + (wall.get_height() if side == "below" else 0.0)
     assert abs(edge - line) <= 0.2 * dx
+
+
+@pytest.mark.parametrize(
+    ("values", "shown"),
+    [
+        ([0.0, 0.0123, 0.16], ["0.000", "0.012", "0.160"]),
+        ([0.0, 1.6, 4.0], ["0.00", "1.60", "4.00"]),
+        ([0.2031, np.nan, 0.3242], ["0.203", "nan", "0.324"]),
+        ([0.00203, 0.00324], ["0.00203", "0.00324"]),
+        ([2.031e-8, 3.242e-8], ["2.03e-08", "3.24e-08"]),
+        ([203.1, 324.2], ["203", "324"]),
+        ([0.0, 1024000.0, 5.123e8], ["0", "1.02e+06", "5.12e+08"]),
+        ([12.3451, 12.3459], ["12.3451", "12.3459"]),
+        ([0.2031, 0.2031], ["0.203100", "0.203100"]),
+        ([0.0, 0.0], ["0", "0"]),
+        ([np.nan], ["nan"]),
+        ([-0.02, 0.01], ["-0.0200", "0.0100"]),
+    ],
+)
+def test_numbers_have_three_digits_of_their_range_in_any_unit(values, shown):
+    assert [f"{value:{format_of(values)}}" for value in values] == shown

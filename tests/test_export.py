@@ -17,17 +17,24 @@ from vtkmodules.util.numpy_support import vtk_to_numpy
 from vtkmodules.vtkIOHDF import vtkHDFReader
 from walker import walker
 
+from mpmopt import export as exporting
 from mpmopt import runfile
 from mpmopt.__main__ import main
 from mpmopt.binary import pieces, solid_body
-from mpmopt.errors import DesignError, ExportError, MissingLibraryError, StorageError
-from mpmopt.export import export
+from mpmopt.errors import (
+    DesignError,
+    ExportError,
+    MissingLibraryError,
+    SimulationError,
+    StorageError,
+)
+from mpmopt.export import export, in_millimetres, stl
 from mpmopt.history import Candidate
 from mpmopt.optimize import Settings, Stage, begin
 from mpmopt.outline import outline
 from mpmopt.particles import lay_out, mirror_images
 from mpmopt.problem import Problem
-from mpmopt.scene import Design, Grid, Scene, Solid
+from mpmopt.scene import Design, Grid, Mirror, Scene, Solid
 
 WIDTH = 60.0  # mm
 C = 1 / 32
@@ -225,6 +232,60 @@ def test_random_designs_are_watertight_too(seed, tmp_path):
     assert mesh.euler_number == 2 * (len(done.polygons) - holes)
 
 
+@pytest.mark.parametrize("mirror", [False, True])
+@pytest.mark.parametrize("designed", [False, True])
+def test_what_meets_in_corners_is_parted(mirror, designed, tmp_path):
+    """Random patches of solid, and of design of which random particles are cut out."""
+    touching = 0
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        patches = rng.choice(3 if designed else 2, size=(4, 4))
+        patches[0, 0] = 1
+        body = [
+            (Solid, Design)[patches[i, j] - 1](
+                ((8 + i) * C, (8 + j) * C), ((9 + i) * C, (9 + j) * C)
+            )
+            for i, j in zip(*np.nonzero(patches))
+        ]
+        if mirror:
+            plane = Mirror("y", 12 * C)
+            body += [
+                type(region)(
+                    (region.lower[0], plane.image(region.upper)[1]),
+                    (region.upper[0], plane.image(region.lower)[1]),
+                )
+                for region in body
+            ]
+            patches = np.concatenate([patches, patches[:, ::-1]], axis=1)
+        scene = Scene(
+            Grid((32, 32), C), 1e-3, 5, tuple(body), particles_per_cell=2,
+            mirror=plane if mirror else None,
+        )  # fmt: skip
+        problem = Problem(scene, beta=8.0)
+        count = problem.particles.designed.sum()
+        x = problem.join(rng.choice([-1.0, 1.0], size=count), [], [], [])
+        polygons = outline(problem, x, keep=rng.random(count) < 0.7)
+        rings = [ring for polygon in polygons for ring in polygon.rings]
+        points = np.round(np.concatenate(rings) / C, 9)
+        assert len(np.unique(points, axis=0)) == len(points)
+        (tmp_path / "a.stl").write_bytes(stl(in_millimetres(polygons, width=20.0), 2.0))
+        mesh = trimesh.load_mesh(str(tmp_path / "a.stl"))
+        assert mesh.is_watertight and mesh.is_winding_consistent
+        holes = len(rings) - len(polygons)
+        assert (mesh.body_count, mesh.euler_number) == (
+            len(polygons), 2 * (len(polygons) - holes),
+        )  # fmt: skip
+        if not designed:
+            there = np.pad(patches == 1, 1)
+            joined = label(there, np.ones((3, 3)))[1]
+            touching += joined != label(there)[1]
+            assert len(polygons) == label(there)[1]
+            assert holes == label(~there, np.ones((3, 3)))[1] - 1
+            area = sum(polygon.area for polygon in polygons) / C**2
+            assert area == pytest.approx(there.sum(), rel=1e-3)
+    assert designed or touching >= 3
+
+
 def test_of_a_mirror_scene_the_whole_body_is_exported(tmp_path):
     half = crawler(64, 8e-4)
     rng = np.random.default_rng(1)
@@ -418,6 +479,36 @@ def test_the_command_writes_all_four_and_says_how_large_it_all_is(holed, tmp_pat
     assert mesh.body_count == 1
     _, frames = read_motion(tmp_path / "motion.vtkhdf")
     assert len(frames[0]["corners"]) == round(particles_area(*holed, True) / (WIDTH / 48) ** 2)
+
+
+def test_a_motion_that_fails_takes_nothing_else_with_it(
+    holed, tmp_path, capsys, caplog, monkeypatch
+):
+    def bursts(body, frames):
+        raise SimulationError("it burst", 3, -1, (np.nan, np.nan), "take another")
+
+    monkeypatch.setattr(exporting.Motion, "of", bursts)
+    path, out = run_file(tmp_path / "run.h5", *holed), tmp_path / "out"
+    options = ["--svg", "--dxf", "--stl", "--vtk", "--width", "60", "--drop-loose"]
+    assert main(["export", str(path), *options, "--out", str(out)]) == 1
+    assert {file.name for file in out.iterdir()} == {"design.svg", "design.dxf", "design.stl"}
+    printed = capsys.readouterr().out
+    assert "design.stl  " in printed and "60 x 50 mm" in printed and "vtkhdf" not in printed
+    (warning,) = caplog.messages
+    assert warning.startswith("no motion.vtkhdf: step 3, body: it burst")
+    with pytest.raises(SimulationError, match="it burst"):
+        export(*holed, tmp_path / "none", ["vtk"])
+    assert not (tmp_path / "none").exists()
+
+
+def test_a_file_that_cannot_be_written_takes_nothing_else_with_it(holed, tmp_path, caplog):
+    (tmp_path / "design.svg").mkdir()
+    done = export(*holed, tmp_path, ["svg", "stl"], width=60.0)
+    assert done.paths == (tmp_path / "design.stl",)
+    assert done.failed == ("svg",)
+    assert caplog.messages[0].startswith("no design.svg: cannot write")
+    with pytest.raises(StorageError, match=r"design\.svg"):
+        export(*holed, tmp_path, ["svg"], width=60.0)
 
 
 def test_the_command_says_what_is_missing(holed, tmp_path, capsys):

@@ -1,8 +1,12 @@
 """Pictures of a run from its file alone, whole or absent; what notebooks and terminals show."""
 
 import dataclasses
+import functools
+import shutil
 from io import BytesIO
 
+import matplotlib
+import matplotlib.style
 import numpy as np
 import pytest
 from conftest import SHORT, empty, small_scene
@@ -11,14 +15,15 @@ from scipy.ndimage import binary_erosion, label
 from test_mirror import channel
 from walker import walker
 
-from mpmopt import draw, files, plot, runfile
+from mpmopt import draw, files, multistart, plot, runfile
 from mpmopt.__main__ import main
 from mpmopt.errors import RunFileError, SimulationError, StorageError
+from mpmopt.film import Screen
 from mpmopt.history import Iteration
-from mpmopt.motion import optimised
+from mpmopt.motion import Motion, optimised
 from mpmopt.optimize import optimise
 from mpmopt.problem import Problem
-from mpmopt.scene import Design, Solid
+from mpmopt.scene import Design, Grid, Solid
 from mpmopt.schematic import schematic
 
 NAMES = {"schematic.png", "history.png", "design.png", "post_processed.png", "reference.png"}
@@ -46,6 +51,81 @@ def test_plot_draws_a_run_from_its_file(short_path, tmp_path, capsys):
     printed = capsys.readouterr()
     assert {line.split("/")[-1] for line in printed.out.splitlines()} == NAMES
     assert "5 of 5 pictures" in printed.err
+
+
+HOSTILE = {
+    "text.usetex": True,  # LaTeX need not be there
+    "font.family": "no such font",
+    "axes.unicode_minus": False,
+    "axes.formatter.use_locale": True,
+    "savefig.bbox": "tight",
+    "savefig.dpi": 30,
+    "figure.dpi": 50,
+    "figure.autolayout": True,
+    "figure.constrained_layout.use": True,
+    "lines.linewidth": 9.0,
+    "hatch.linewidth": 9.0,
+    "patch.antialiased": False,
+    "path.simplify_threshold": 1.0,
+    "path.sketch": (5.0, 50.0, 5.0),
+    "image.cmap": "gray",
+}
+
+
+def test_pictures_are_the_same_whatever_the_users_style_is(
+    short_run, short_path, tmp_path, monkeypatch
+):
+    small = functools.partial(draw.png, dpi=20)
+    for module in (draw, plot):
+        monkeypatch.setattr(module, "png", lambda figure, dpi=None: small(figure))
+    body = optimised(short_run.problem(), short_run.best)
+    motion = Motion.of(body, [0, 20])
+    shutil.copytree(short_path.parent, tmp_path / "start-0")
+    row = {"start": 0, "gain": 0.1, "audited_gain": 0.05}
+
+    def content():
+        plot.plot_motion(tmp_path / "motion.png", body, 1)
+        plot.plot_history(tmp_path / "history.png", short_run.run)
+        multistart.draw(tmp_path / "starts.png", tmp_path, [row])
+        for name in ("motion", "history", "starts"):
+            yield (tmp_path / f"{name}.png").read_bytes()
+        yield short_run.scene._repr_png_()
+        yield short_run._repr_png_()
+        yield Screen([motion], 1.0).frame(1).tobytes()
+
+    wanted = list(content())
+    with matplotlib.rc_context():
+        matplotlib.style.use("dark_background")
+        matplotlib.rcParams.update(HOSTILE)
+        for number, (one, other) in enumerate(zip(content(), wanted, strict=True)):
+            assert one == other, number
+        assert matplotlib.rcParams["savefig.dpi"] == 30  # and it is theirs again
+
+
+def test_instants_and_distances_of_a_small_and_fast_robot_can_be_read(monkeypatch, tmp_path):
+    c = 1e-4  # a robot of half a millimetre in metres, in motion for 100 microseconds
+    scene = small_scene(
+        grid=Grid((16, 16), c), time_step=1e-6, steps=100, gravity=(1e2, 0.0), walls=(),
+        body=(Solid((4 * c, 6 * c), (9 * c, 8 * c)),),
+    )  # fmt: skip
+    figures = []
+    monkeypatch.setattr(plot, "png", lambda figure: figures.append(figure) or b"")
+    plot.plot_motion(tmp_path / "a.png", optimised(Problem(scene), np.empty(0)), 3)
+    (figure,) = figures
+    assert figure.get_suptitle() == "Optimised design, L = 0.000650505"  # it moved by 5e-7
+    titles = [axes.get_title() for axes in figure.axes if axes.axison]
+    assert titles == ["t = 0.000000", "t = 0.000050", "t = 0.000100"]
+
+
+@pytest.mark.parametrize("unit", [2.0**-40, 2.0**40])
+def test_a_schematic_says_the_same_in_any_unit_of_length(unit):
+    c = unit / 16
+    scene = small_scene(
+        grid=Grid((16, 16), c), time_step=unit * 4e-3, walls=(), gravity=(0.0, 0.0),
+        body=(Solid((3 * c, 4 * c), (7 * c, 6 * c)), Solid((3 * c, 6 * c), (6 * c, 7 * c))),
+    )  # fmt: skip
+    lengths = [word for word in words(schematic(scene)) if word[:1].isdigit()]
+    assert sorted(lengths) == sorted(f"{k * c:.6g}" for k in (4, 3, 1, 3, 2, 1))
 
 
 def test_a_history_is_the_same_from_a_run_and_from_its_file(tmp_path):

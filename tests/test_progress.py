@@ -37,16 +37,16 @@ def test_where_the_end_is_not_known_there_is_a_line_every_ten(capsys):
     assert [line.split(",")[0] for line in lines] == ["10 gradients", "20 gradients"]
 
 
-@pytest.mark.skipif(not hasattr(os, "openpty"), reason="no pseudo-terminals")
-def test_on_a_terminal_there_is_a_bar_and_results_stay_whole():
+def on_a_terminal(work, columns=80):
+    """What a process writes to standard output, a pipe, and to standard error, a terminal."""
     import fcntl
     import pty
     import termios
 
     master, slave = pty.openpty()
-    fcntl.ioctl(slave, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))
+    fcntl.ioctl(slave, termios.TIOCSWINSZ, struct.pack("HHHH", 24, columns, 0, 0))
     process = subprocess.Popen(
-        [sys.executable, "-c", WORK], stdout=subprocess.PIPE, stderr=slave,
+        [sys.executable, "-c", work], stdout=subprocess.PIPE, stderr=slave,
         env={**os.environ, "PYTHONPATH": str(ROOT)},
     )  # fmt: skip
     os.close(slave)
@@ -58,9 +58,81 @@ def test_on_a_terminal_there_is_a_bar_and_results_stay_whole():
         pass
     results, _ = process.communicate(timeout=30)
     os.close(master)
-    assert process.returncode == 0
-    assert results.decode().splitlines() == [f"result {k}" for k in range(20)]
-    assert b"steps" in said and b"20" in said
-    assert b"number" in said
-    assert b"result" not in said
-    assert b"of 20 steps" not in said
+    return process.returncode, results.decode(), said.decode()
+
+
+def seen(said):
+    """The lines of a terminal once all of this is written; no bar is so high that it scrolls."""
+    lines, row, column = [""], 0, 0
+    for character in said.replace("\x1b[A", "\v"):
+        if character == "\r":
+            column = 0
+        elif character == "\n":
+            row += 1
+            lines += [""] * (row + 1 - len(lines))
+        elif character == "\v":
+            row -= 1
+        else:
+            line = lines[row].ljust(column)
+            lines[row] = line[:column] + character + line[column + 1 :]
+            column += 1
+    return [line.rstrip() for line in lines]
+
+
+needs_terminal = pytest.mark.skipif(not hasattr(os, "openpty"), reason="no pseudo-terminals")
+
+
+@needs_terminal
+def test_on_a_terminal_there_is_a_bar_and_results_stay_whole():
+    code, results, said = on_a_terminal(WORK)
+    assert code == 0
+    assert results.splitlines() == [f"result {k}" for k in range(20)]
+    assert "steps" in said and "20" in said
+    assert "number" in said
+    assert "result" not in said
+    assert "of 20 steps" not in said
+
+
+LOGS = """
+import logging, sys, time, warnings
+from mpmopt.errors import StorageError
+from mpmopt.interrupt import reported
+from mpmopt.progress import Progress
+{setup}
+def work():
+    progress = Progress("steps", 3)
+    for k in range(3):
+        progress.step("all is well")
+        time.sleep(0.15)  # the bar is drawn
+        logging.getLogger("mpmopt.some").warning("logged %d", k)
+        warnings.warn(f"warned {{k}}")
+        print("printed", k, file=sys.stderr)
+    print("in ", end="", file=sys.stderr)
+    print("parts", file=sys.stderr)
+    {end}
+code = reported(work, lambda: "Advice.")
+logging.getLogger("mpmopt.some").warning("the end")
+sys.exit(code)
+"""
+
+
+@needs_terminal
+@pytest.mark.parametrize(("setup", "end"), [
+    ("", "raise StorageError('no room')"),
+    ("logging.basicConfig(format='%(message)s')", "progress.close()"),
+    ("logging.getLogger('mpmopt').addHandler(logging.StreamHandler())",
+     "raise StorageError('no room')"),
+])  # fmt: skip
+def test_no_line_of_a_terminal_holds_a_bar_and_something_else(setup, end):
+    code, _, said = on_a_terminal(LOGS.format(setup=setup, end=end))
+    assert said.count("all is well") >= 3  # the bar was there
+    lines = [line for line in seen(said) if line and not line.startswith("  warnings.warn(")]
+    wanted = [
+        line
+        for k in range(3)
+        for line in (f"logged {k}", f"<string>:13: UserWarning: warned {k}", f"printed {k}")
+    ]
+    wanted.append("in parts")
+    if code:
+        wanted.append("StorageError: no room")
+    assert lines == [*wanted, "the end"]
