@@ -317,6 +317,7 @@ class Cheapest:
 
 def carried(problem: Problem, x: NDArray[np.float64]) -> Design:
     """A design of one problem as one for all others, by `Problem.transfer`."""
+    x = np.array(x)
     return lambda there: there.transfer(problem, x)
 
 

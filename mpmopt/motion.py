@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from mpmopt.binary import full_block, kept, solid_body
 from mpmopt.objective import Objective
+from mpmopt.particles import own
 from mpmopt.problem import Problem
 from mpmopt.scene import Mirror, Scene
 from mpmopt.simulate import Simulation
@@ -46,6 +47,9 @@ class Body:
     name: str
     simulation: Simulation
     gamma: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        own(self, "gamma")
 
 
 def optimised(problem: Problem, x: NDArray[np.float64]) -> Body:
@@ -119,7 +123,7 @@ class Motion:
             As `Simulation.run` does.
         """
         simulation, gamma = body.simulation, body.gamma
-        scene, frames = simulation.scene, np.asarray(frames)
+        scene, frames = simulation.scene, np.array(frames)
         transient = scene.transient_steps
         wanted = sorted({*map(int, frames), transient})
         found = dict(zip(wanted, simulation.run(wanted)))

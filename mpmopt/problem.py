@@ -157,7 +157,7 @@ class Problem:
             If x has another size, or an entry is not finite or outside [-1, 1].
         """
         x = _array("x", x)
-        x = x if x.dtype == complex else _real("x", x)
+        x = x.copy() if x.dtype == complex else _real("x", x)
         if x.shape != (self.size,):
             raise DesignError(f"x has shape {x.shape}, this problem's variables {(self.size,)}")
         outside = ~(np.abs(x.real) <= 1.0)

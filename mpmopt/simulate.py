@@ -209,8 +209,8 @@ class Simulation:
                 0, -(-count // 4), min(max(count // BLOCK, 1), BLOCKS) + 1, dtype=np.int64
             ),
         )
-        self.signal = np.ascontiguousarray(signal, dtype=dtype)
-        self.initial = np.ascontiguousarray(state, dtype=dtype)
+        self.signal = np.array(signal, dtype=dtype, order="C")
+        self.initial = np.array(state, dtype=dtype, order="C")
 
     def run(self, frames: Sequence[int] | None = None) -> NDArray:
         """Run forward and keep nothing.
@@ -296,7 +296,7 @@ class Simulation:
         most = (self.world.nodes_x, self.world.nodes_y)
 
         def nodes(first: int, last: int) -> int:
-            cells = np.minimum(np.ptp(position[:, first:last], axis=1) / self.world.dx, most)
+            cells = np.fmin(np.ptp(position[:, first:last], axis=1) / self.world.dx, most)
             return int(np.prod(np.ceil(1.25 * cells) + 4))
 
         first = 4 * self.body.first
@@ -416,6 +416,7 @@ class Memory:
 
     def __init__(self) -> None:
         self._buffers: dict[str, NDArray[np.uint8]] = {}
+        self.runs = 0  # that it was given to
 
     def take(self, name: str, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray:
         """An array with any content, in the place of the last one of that name."""
@@ -437,6 +438,8 @@ class _Segment:
 
     def __init__(self, simulation: Simulation, length: int, memory: Memory) -> None:
         self.simulation, self.memory = simulation, memory
+        memory.runs += 1
+        self.run = memory.runs
         groups, dtype = simulation.body.mass.shape[0], simulation.initial.dtype
         states = (length + 1, mpm.STATE_SIZE * groups, 4)
         self.states = memory.take("states", states, dtype)
@@ -588,12 +591,15 @@ class Forward:
         Raises
         ------
         DesignError
-            If called a second time: going back overwrites what it needs.
+            If called a second time, as going back overwrites what it needs; or if another run was
+            given the same memory meanwhile.
         StorageError
             If a checkpoint cannot be read back.
         """
         if self._reversed:
             raise DesignError("this run was gone back through already; run forward again")
+        if self._memory.memory.runs != self._memory.run:
+            raise DesignError("another run took this one's memory; give each run its own")
         self._reversed = True
         simulation, memory = self._simulation, self._memory
         schedule = self._checkpoints.schedule
