@@ -92,21 +92,23 @@ def postprocess(path: Path, threshold: float) -> int:
     import numpy as np
 
     from mpmopt import runfile
-    from mpmopt.binary import farthest, full_block, kept, pieces, post_processed
+    from mpmopt.binary import farthest, full_block, kept, pieces, post_processed, share_kept
 
     run = runfile.read(path)
     problem, x = run.problem(), run.best
     keep = kept(problem, x, threshold)
     optimised = problem.value(x)
     value = post_processed(problem, x, threshold)
-    reference = run.summary.get("reference") or farthest(
-        problem.scene, full_block, problem.split(x)
-    )
+    reference = run.summary.get("reference")
+    if reference is None:
+        reference = farthest(problem.scene, full_block, problem.split(x))
+    share = share_kept(problem.scene, value - reference, optimised - reference)
+    shown = "no gain to keep" if np.isnan(share) else f"{share:.1%}"
     sizes = np.bincount(pieces(problem.scene, keep)[keep])
     print(f"reference (full block)   {reference:.4f}")
     print(f"optimised                {optimised:.4f}")
     print(f"post-processed           {value:.4f}  (gamma >= {threshold:g} solid, the rest removed)")
-    print(f"share of the gain kept   {(value - reference) / (optimised - reference):.1%}")
+    print(f"share of the gain kept   {shown}")
     print(f"design particles kept    {keep.sum()} of {keep.size}")
     loose = ", ".join(str(size) for size in sorted(sizes[1:], reverse=True)) or "none"
     print(f"pieces hanging on nothing, particles of each: {loose}")

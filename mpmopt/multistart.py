@@ -219,7 +219,10 @@ def report(rows: Sequence[dict[str, Any]]) -> str:
     }
     lines = ["  ".join(heading for heading, _ in columns.values())]
     for row in rows:
-        cells = (f"{row[name]:{form}}".rjust(len(head)) for name, (head, form) in columns.items())
+        cells = (
+            ("-" if row[name] != row[name] else f"{row[name]:{form}}").rjust(len(head))
+            for name, (head, form) in columns.items()
+        )
         lines.append("  ".join(cells))
     for name in ("gain", "audited_gain"):
         values = [row[name] for row in rows if math.isfinite(row[name])]
@@ -230,7 +233,9 @@ def report(rows: Sequence[dict[str, Any]]) -> str:
                 f"deviation {np.std(values):.3f}"
             )
     best = best_of(rows)
-    lines.append(f"best after its audit: start-{best['start']}, gain {best['audited_gain']:.3f}")
+    gain = best["audited_gain"]
+    found = f"gain {gain:.3f}" if math.isfinite(gain) else "which has no audited gain"
+    lines.append(f"best after its audit: start-{best['start']}, {found}")
     return "\n".join(lines)
 
 

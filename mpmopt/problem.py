@@ -203,7 +203,10 @@ class Problem:
         )
 
     def objective(self, simulation: Simulation) -> Objective:
-        """How far the body of one of this problem's simulations goes."""
+        """How far the body of a simulation goes: of this problem's, or of a solid one of its scene.
+
+        What pictures, post-processing and audits measure too, should a subclass have another.
+        """
         return Objective.of(simulation.particles, self.scene.direction)
 
     def at(self, time_step: float) -> Problem:

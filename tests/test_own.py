@@ -141,8 +141,9 @@ def test_a_motion_and_a_design_that_is_carried_keep_their_own():
     problem = Problem(SCENE, 2.0)
     x = problem.join(0.3, 0.9, -0.3, -0.5)
     simulation, frames = problem.simulation(x), np.array([0, 6, 12])
+    objective = problem.objective(simulation)
     gamma = np.full(len(simulation.particles.position), 0.5)
-    motion = Motion.of(Body("a", simulation, gamma), frames)
+    motion = Motion.of(Body("a", simulation, gamma, objective), frames)
     design, wanted = carried(problem, x), x.copy()
     spoil(gamma, frames, x)
     assert motion.frames.tolist() == [0, 6, 12]
@@ -150,7 +151,7 @@ def test_a_motion_and_a_design_that_is_carried_keep_their_own():
     assert np.array_equal(design(problem), wanted)
     before = motion.objective.copy()
     spoil(*arrays(motion).values())
-    again = Motion.of(Body("a", simulation, np.ones(48)), [0, 6, 12])
+    again = Motion.of(Body("a", simulation, np.ones(48), objective), [0, 6, 12])
     assert np.array_equal(again.objective, before)
 
 
