@@ -171,11 +171,13 @@ def cheapest(path: Path, tolerance: float, gradient_tolerance: float | None, sec
             progress=show,
         )
     print(f"reference                {found.reference.discretisation}")
-    print(
-        f"its own uncertainty      travel {found.objective_uncertainty:.1%}, "
-        f"gradient {found.gradient_uncertainty:.1%}"
-    )
-    print(f"cheapest within {tolerance:<8.3g} {found.best}")
+    own = (found.objective_uncertainty, found.gradient_uncertainty)
+    travel, gradient = ("unknown" if value != value else f"{value:.1%}" for value in own)
+    print(f"its own uncertainty      travel {travel}, gradient {gradient}")
+    label = "cheapest near it" if found.doubt else f"cheapest within {tolerance:.3g}"
+    print(f"{label:<24} {found.best}")
+    if found.doubt:
+        print(found.doubt)
     return 0
 
 
