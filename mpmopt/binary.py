@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import label
 
 from mpmopt.actuation import signal
+from mpmopt.checks import shown
 from mpmopt.errors import DesignError, SimulationError
 from mpmopt.objective import Objective
 from mpmopt.particles import lay_out
@@ -105,8 +106,9 @@ def kept(problem: Problem, x: NDArray, threshold: float = THRESHOLD) -> NDArray[
     DesignError
         If x does not fit, or the threshold is not between 0 and 1.
     """
-    if not 0.0 < threshold < 1.0:
-        raise DesignError(f"threshold = {threshold:g} must be between 0 and 1")
+    kinds = (int, float, np.integer, np.floating)
+    if not isinstance(threshold, kinds) or not 0.0 < threshold < 1.0:
+        raise DesignError(f"threshold = {shown(threshold)} must be between 0 and 1")
     return problem.gamma(x) >= threshold
 
 

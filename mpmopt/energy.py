@@ -17,7 +17,7 @@ LOOK = 64
 # Between two looks at an actuator, its signal changes by so much of its greatest size at most; with
 # the mean signal, its work is known to the square of that over twelve.
 SIGNAL_CHANGE = 0.2
-# Units in the last place that energies are off by, several times.
+# Units in the last place that energies of few particles are off by, several times.
 ROUNDING = 32.0
 
 
@@ -117,7 +117,7 @@ class Balance:
         self._seen, self._held = -1, np.zeros(signal.shape[1])
         self._last: tuple[float, float] | None = None
         self._lowest, self._rise, self._turnover = math.inf, 0.0, 0.0
-        # What is rounding only: of strains, and of positions in gravity; with room for few particles.
+        # What is rounding only: of strains, and of positions in gravity.
         modulus = float((body.volume.real * (body.lame_lambda.real + 2 * body.lame_mu.real)).sum())
         weight = float(body.mass.real.sum()) * math.hypot(world.gravity_x, world.gravity_y)
         height = world.dx * max(world.nodes_x, world.nodes_y)

@@ -170,9 +170,6 @@ class Simulation:
             state = np.zeros((mpm.STATE_SIZE, count))
             state[0:2] = particles.position.T
             state[8] = state[11] = 1.0
-        dtype = np.result_type(density, lame_lambda, lame_mu, signal, state, float)
-        if precision == "single" and dtype.kind == "f":
-            dtype = np.dtype(np.float32)
         shapes = {
             "density": (density, (count,)),
             "lame_lambda": (lame_lambda, (count,)),
@@ -183,10 +180,18 @@ class Simulation:
         for name, (array, shape) in shapes.items():
             if np.shape(array) != shape:
                 raise DesignError(f"{name} has shape {np.shape(array)}, must have {shape}")
+            kind = np.asarray(array).dtype
+            if kind.kind not in "fciu":
+                raise DesignError(f"{name} holds {kind}, must hold numbers")
+            if np.ma.is_masked(array):
+                raise DesignError(f"{name} has masked entries, which have no value; fill them")
             if not np.all(np.isfinite(array)):
                 raise DesignError(f"{name} holds {np.sum(~np.isfinite(array))} values not finite")
         if count == 0:
             raise DesignError("the body has no particles")
+        dtype = np.result_type(density, lame_lambda, lame_mu, signal, state, float)
+        if precision == "single" and dtype.kind == "f":
+            dtype = np.dtype(np.float32)
         if not np.real(density).min() > 0.0:
             raise DesignError(f"density {np.real(density).min():g} must be above 0")
         real = np.empty(0, dtype).real.dtype
@@ -230,8 +235,13 @@ class Simulation:
             If a particle leaves the grid, inverts, or is not a number.
         """
         wanted = [self.scene.steps] if frames is None else list(frames)
-        if wanted != sorted(wanted) or (wanted and not 0 <= wanted[0] <= wanted[-1] <= self.steps):
-            raise DesignError(f"frames must increase from 0 to {self.steps}, got {wanted}")
+        whole = all(isinstance(frame, (int, np.integer)) for frame in wanted)
+        ends = [0, *wanted, self.steps]
+        if not whole or ends != sorted(ends):
+            raise DesignError(
+                f"frames must be whole numbers that increase from 0 to {self.steps}, got "
+                f"{shown(wanted)}"
+            )
         memory = _Segment(self, 1, Memory())
         states = memory.states
         states[0] = mpm.grouped(self.initial)

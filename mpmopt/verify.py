@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from mpmopt import mpm
 from mpmopt.actuation import signal, signal_adjoint
+from mpmopt.checks import count
 from mpmopt.design import DesignChain
 from mpmopt.errors import DesignError
 from mpmopt.objective import Objective
@@ -491,6 +492,7 @@ def _complex_steps(
     directions: int,
     seed: int,
 ) -> Iterator[tuple[str, ComplexStep]]:
+    directions = count("complex_step_test", "directions", directions, 0, error=DesignError)
     rng, ulp = np.random.default_rng(seed), np.finfo(float).eps
     move = 2.0 * ulp * rng.choice([-1.0, 1.0], x.size)
     # To both sides, for a body at rest on a wall is where the objective has a kink.

@@ -168,3 +168,18 @@ def test_an_optimisation_keeps_its_own():
     found = optimise(SCENE, SHORT, x, [spoilt])
     assert np.array_equal(found.last.x, expected.last.x)
     assert [i.objective for i in found.history] == [i.objective for i in expected.history]
+
+
+@pytest.mark.parametrize(
+    ("name", "wrong"),
+    [
+        ("density", lambda a: a.astype(str)),
+        ("signal", lambda a: np.ma.masked_greater(a, 0.5)),
+        ("lame_mu", lambda a: a > 0.0),
+        ("state", lambda a: a.astype(object)),
+    ],
+)
+def test_a_simulation_of_what_are_no_numbers_is_refused(name, wrong):
+    inputs, given = parts()
+    with pytest.raises(DesignError, match=name):
+        Simulation(SCENE, Particles(*inputs.values()), **{**given, name: wrong(given[name])})
