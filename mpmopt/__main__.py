@@ -92,7 +92,7 @@ def postprocess(path: Path, threshold: float) -> int:
     import numpy as np
 
     from mpmopt import runfile
-    from mpmopt.binary import farthest, full_block, kept, pieces, post_processed
+    from mpmopt.binary import farthest, full_block, kept, pieces, post_processed, share_kept
     from mpmopt.checks import digits
 
     run = runfile.read(path)
@@ -100,18 +100,17 @@ def postprocess(path: Path, threshold: float) -> int:
     keep = kept(problem, x, threshold)
     optimised = problem.value(x)
     value = post_processed(problem, x, threshold)
-    reference = run.summary.get("reference") or farthest(
-        problem.scene, full_block, problem.split(x)
-    )
+    reference = run.summary.get("reference")
+    if reference is None:
+        reference = farthest(problem.scene, full_block, problem.split(x))
+    share = share_kept(problem.scene, value - reference, optimised - reference)
+    shown = "no gain to keep" if np.isnan(share) else f"{share:.1%}"
     sizes = np.bincount(pieces(problem.scene, keep)[keep])
-    gain = optimised - reference
-    is_one = gain > 1e-12 * max(problem.scene.grid.size)  # more than rounding
-    share = f"{(value - reference) / gain:.1%}" if is_one else "none, there is no gain"
     solid = f"(gamma >= {threshold:g} solid, the rest removed)"
     print(f"reference (full block)   {digits(reference)}")
     print(f"optimised                {digits(optimised)}")
     print(f"post-processed           {digits(value)}  {solid}")
-    print(f"share of the gain kept   {share}")
+    print(f"share of the gain kept   {shown}")
     print(f"design particles kept    {keep.sum()} of {keep.size}")
     loose = ", ".join(str(size) for size in sorted(sizes[1:], reverse=True)) or "none"
     print(f"pieces hanging on nothing, particles of each: {loose}")
@@ -175,11 +174,13 @@ def cheapest(path: Path, tolerance: float, gradient_tolerance: float | None, sec
             progress=show,
         )
     print(f"reference                {found.reference.discretisation}")
-    print(
-        f"its own uncertainty      travel {found.objective_uncertainty:.1%}, "
-        f"gradient {found.gradient_uncertainty:.1%}"
-    )
-    print(f"cheapest within {tolerance:<8.3g} {found.best}")
+    own = (found.objective_uncertainty, found.gradient_uncertainty)
+    travel, gradient = ("unknown" if value != value else f"{value:.1%}" for value in own)
+    print(f"its own uncertainty      travel {travel}, gradient {gradient}")
+    label = "cheapest near it" if found.doubt else f"cheapest within {tolerance:.3g}"
+    print(f"{label:<24} {found.best}")
+    if found.doubt:
+        print(found.doubt)
     return 0
 
 

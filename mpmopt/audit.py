@@ -73,7 +73,7 @@ def least(problem: Problem, x: NDArray[np.float64]) -> float:
     """
     scene = problem.scene
     return min(
-        distance(there, laid_out(there, problem, x), problem.split(x))
+        distance(there, laid_out(there, problem, x), problem.split(x), problem.objective)
         for there in (scene.vary(time_step=scene.time_step / 2.0), refined(scene))
     )
 
@@ -134,11 +134,12 @@ def audit(
         try:
             there = make()
             keep = laid_out(there, problem, x)
-            reference = distance(there, np.ones_like(keep), variables)
+            reference = distance(there, np.ones_like(keep), variables, problem.objective)
             row = Audited(name, there.grid.cells, there.time_step, reference)
-            row = replace(row, distance=distance(there, keep, variables))
+            design = distance(there, keep, variables, problem.objective)
+            row = replace(row, distance=design)
             gain = rows[0].distance - rows[0].reference if rows else row.distance - reference
-            kept = (row.distance - reference) / gain if gain > 0.0 else np.nan
+            kept = binary.share_kept(scene, design - reference, gain)
             rows.append(replace(row, kept=kept))
         except (SceneError, SimulationError) as error:
             rows.append(Audited(name, there.grid.cells, there.time_step, failure=str(error)))

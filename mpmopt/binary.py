@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import label
 
 from mpmopt.actuation import signal
+from mpmopt.checks import shown
 from mpmopt.errors import DesignError, SimulationError
 from mpmopt.objective import Objective
 from mpmopt.particles import lay_out
@@ -17,6 +18,7 @@ from mpmopt.scene import Scene
 from mpmopt.simulate import Simulation
 
 THRESHOLD = 0.3  # of gamma, as in the paper
+NO_GAIN = 1e-12  # over the grid's size: what two equal bodies may differ by
 # Stretch over the particles per cell beyond which some cell has none: a body may crack there. An
 # optimiser may pass through (`problem.LIMITS`), but nothing that went so far counts. What a cut
 # carries depends on this ratio alone, so one particle per cell bears no stretch at all.
@@ -67,8 +69,20 @@ def solid_body(
     return simulation, Objective.of(particles, scene.direction)
 
 
-def distance(scene: Scene, keep: NDArray[np.bool_], variables: Variables) -> float:
+def distance(
+    scene: Scene,
+    keep: NDArray[np.bool_],
+    variables: Variables,
+    objective: Callable[[Simulation], Objective] | None = None,
+) -> float:
     """Objective L of a `solid_body`.
+
+    Parameters
+    ----------
+    scene, keep, variables
+        As in `solid_body`.
+    objective : callable, optional
+        That of a problem (`Problem.objective`), if it is not the scene's.
 
     Raises
     ------
@@ -77,10 +91,12 @@ def distance(scene: Scene, keep: NDArray[np.bool_], variables: Variables) -> flo
     SimulationError
         If the simulation fails, its solid may be torn (`WHOLE`), or energy appears from nowhere.
     """
-    simulation, objective = solid_body(scene, keep, variables)
+    simulation, travel = solid_body(scene, keep, variables)
     end = simulation.watch()
     refuse_nonsense(end.margins, simulation, WHOLE)
-    return float(objective.value(end.state, end.settled))
+    if objective is not None:
+        travel = objective(simulation)
+    return float(travel.value(end.state, end.settled))
 
 
 def kept(problem: Problem, x: NDArray, threshold: float = THRESHOLD) -> NDArray[np.bool_]:
@@ -91,8 +107,9 @@ def kept(problem: Problem, x: NDArray, threshold: float = THRESHOLD) -> NDArray[
     DesignError
         If x does not fit, or the threshold is not between 0 and 1.
     """
-    if not 0.0 < threshold < 1.0:
-        raise DesignError(f"threshold = {threshold:g} must be between 0 and 1")
+    kinds = (int, float, np.integer, np.floating)
+    if not isinstance(threshold, kinds) or not 0.0 < threshold < 1.0:
+        raise DesignError(f"threshold = {shown(threshold)} must be between 0 and 1")
     return problem.gamma(x) >= threshold
 
 
@@ -106,14 +123,20 @@ def post_processed(problem: Problem, x: NDArray, threshold: float = THRESHOLD) -
     SimulationError
         As `distance`.
     """
-    return distance(problem.scene, kept(problem, x, threshold), problem.split(x))
+    keep, variables = kept(problem, x, threshold), problem.split(x)
+    return distance(problem.scene, keep, variables, problem.objective)
+
+
+def share_kept(scene: Scene, kept: float, gain: float) -> float:
+    """Share of a gain that is kept; not a number if there was none beyond rounding."""
+    return kept / gain if gain > NO_GAIN * max(scene.grid.size) else float("nan")
 
 
 def unactuated(problem: Problem, x: NDArray) -> float:
     """Objective L of the post-processed design when no actuator works: how far it merely falls."""
     variables = problem.split(x)
     still = variables._replace(a=0.0 * variables.a, b=0.0 * variables.b)
-    return distance(problem.scene, kept(problem, x), still)
+    return distance(problem.scene, kept(problem, x), still, problem.objective)
 
 
 def pieces(scene: Scene, keep: NDArray[np.bool_]) -> NDArray[np.int64]:
@@ -150,7 +173,12 @@ def full_block(positions: NDArray[np.float64]) -> NDArray[np.bool_]:
     return np.ones(len(positions), dtype=bool)
 
 
-def farthest(scene: Scene, drawing: Drawing, *actuations: Variables) -> float:
+def farthest(
+    scene: Scene,
+    drawing: Drawing,
+    *actuations: Variables,
+    objective: Callable[[Simulation], Objective] | None = None,
+) -> float:
     """Objective L of a drawn design with the best of some actuations, of those that run.
 
     Parameters
@@ -159,6 +187,8 @@ def farthest(scene: Scene, drawing: Drawing, *actuations: Variables) -> float:
     drawing : callable
         From the design particles' reference positions (D, 2) to which of them are there (D,).
     actuations : Variables
+    objective : callable, optional
+        As in `distance`.
 
     Raises
     ------
@@ -170,7 +200,7 @@ def farthest(scene: Scene, drawing: Drawing, *actuations: Variables) -> float:
     values, failure = [], None
     for actuation in actuations:
         try:
-            values.append(distance(scene, keep, actuation))
+            values.append(distance(scene, keep, actuation, objective))
         except SimulationError as error:
             failure = error
     if failure is not None and not values:

@@ -248,6 +248,7 @@ class Checkpoints:
         """
         try:
             array = np.asarray(self._store[name][segment])
+            array.setflags(write=False)  # it may be a view of the store
             if (segment, name) in self._sums:
                 where, checksum = self._sums[segment, name]
                 if _checksum(array[where]) != checksum:

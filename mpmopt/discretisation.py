@@ -16,8 +16,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mpmopt.binary import NO_GAIN
 from mpmopt.checkpoints import Checkpointing
-from mpmopt.checks import number
+from mpmopt.checks import count, number
 from mpmopt.errors import DesignError, SceneError, SimulationError
 from mpmopt.particles import mirror_images
 from mpmopt.problem import Problem, Variables
@@ -98,9 +99,11 @@ class Discretisation:
             mirror=self.mirror,
         )
 
-    def problem(self, scene: Scene, beta: float, **options: Any) -> Problem:
-        """The `Problem` of the scene in this discretisation, with further options of it."""
-        return Problem(self.scene(scene), beta, precision=self.precision, **options)
+    def problem(
+        self, scene: Scene, beta: float, kind: type[Problem] = Problem, **options: Any
+    ) -> Problem:
+        """The problem of the scene in this discretisation, with further options of its class."""
+        return kind(self.scene(scene), beta, precision=self.precision, **options)
 
 
 @dataclass(frozen=True)
@@ -120,6 +123,8 @@ class Measured:
         Its `density`.
     failure : str
         Why there are no numbers, or empty.
+    size : float
+        Longest side of the grid: a travel of less than 1e-12 of it is rounding.
     """
 
     discretisation: Discretisation
@@ -128,25 +133,30 @@ class Measured:
     travel: float = math.nan
     gradient: NDArray[np.float64] = field(default_factory=lambda: np.empty(0), repr=False)
     failure: str = ""
+    size: float = 0.0
 
     def errors(self, reference: Measured) -> tuple[float, float, float]:
         """Relative error of travel, relative error of the gradient, and the angle in degrees.
 
-        Against a reference whose gradient is summed over the same patches.
+        Against a reference whose gradient is summed over the same patches. Of a body that does not
+        travel, relative to what rounding may do.
         """
         if self.failure or reference.failure:
             return math.nan, math.nan, math.nan
         one, other = self.gradient, reference.gradient
         lengths = float(np.linalg.norm(one)), float(np.linalg.norm(other))
-        travel = abs(self.travel / reference.travel - 1.0)
+        rounding = NO_GAIN * reference.size
+
+        def relative(difference: float, whole: float) -> float:
+            scale = max(whole, rounding)
+            return difference / scale if scale > 0.0 else math.inf if difference > 0.0 else 0.0
+
+        travel = relative(abs(self.travel - reference.travel), abs(reference.travel))
+        gradient = relative(float(np.linalg.norm(one - other)), lengths[1])
         if not all(lengths):
-            return travel, math.nan, math.nan
+            return travel, gradient, math.nan
         cosine = float(one @ other) / (lengths[0] * lengths[1])
-        return (
-            travel,
-            float(np.linalg.norm(one - other)) / lengths[1],
-            math.degrees(math.acos(min(1.0, max(-1.0, cosine)))),
-        )
+        return travel, gradient, math.degrees(math.acos(min(1.0, max(-1.0, cosine))))
 
 
 def density(
@@ -203,6 +213,7 @@ def measure(
     checkpointing: Checkpointing | None = None,
     redo: int = 0,
     repeats: int = 1,
+    kind: type[Problem] = Problem,
 ) -> Measured:
     """Objective and gradient of a design in one discretisation, and their cost.
 
@@ -218,15 +229,19 @@ def measure(
         Width of the squares over which the gradient is summed (`density`).
     repeats : int, optional
         Evaluations of which the fastest counts.
+    kind : type, optional
+        Class of the problem, should it have an objective of its own.
 
     Returns
     -------
     Measured
         A scene that cannot be, or a simulation that fails, says so there.
     """
+    number("measure", "patch", patch, above=0.0, error=DesignError)
+    count("measure", "repeats", repeats, 1, error=DesignError)
     try:
         problem = discretisation.problem(
-            scene, beta, leave_out=leave_out, checkpointing=checkpointing, redo=redo
+            scene, beta, kind, leave_out=leave_out, checkpointing=checkpointing, redo=redo
         )
         x = design(problem)
         simulation = problem.simulation(x)
@@ -248,6 +263,7 @@ def measure(
         (numbers + stored) / 1e6,
         evaluation.value - start,
         density(problem, evaluation.gradient, patch, discretisation.mirror or scene.mirror),
+        size=max(scene.grid.size),
     )
 
 
@@ -284,10 +300,11 @@ class Evidence:
         name = f"{self.measured.discretisation}"
         if self.measured.failure:
             return f"{name:<63}  failed: {self.measured.failure}"
+        angle = "  none" if math.isnan(self.angle) else f"{self.angle:5.1f} deg"
         return (
-            f"{name:<63}  {self.measured.seconds:8.3f} s  travel {self.measured.travel:8.5f}  "
+            f"{name:<63}  {self.measured.seconds:8.3f} s  travel {self.measured.travel:10.4g}  "
             f"off by {self.objective_error:7.2%}  gradient {self.gradient_error:7.2%}, "
-            f"{self.angle:5.1f} deg  {'within' if self.within else ''}"
+            f"{angle:<9}  {'within' if self.within else ''}"
         )
 
 
@@ -306,6 +323,8 @@ class Cheapest:
         tolerance below these says more than the reference knows.
     rows : tuple of Evidence
         All that was measured besides, in this order.
+    tolerance, gradient_tolerance : float
+        What was asked for.
     """
 
     best: Discretisation
@@ -313,10 +332,34 @@ class Cheapest:
     objective_uncertainty: float
     gradient_uncertainty: float
     rows: tuple[Evidence, ...]
+    tolerance: float
+    gradient_tolerance: float
+
+    @property
+    def doubt(self) -> str:
+        """Where the tolerances are below what the reference knows, a sentence that says so."""
+        parts = (
+            ("travel", self.objective_uncertainty, self.tolerance),
+            ("the gradient", self.gradient_uncertainty, self.gradient_tolerance),
+        )
+        unknown = [
+            f"{name} {'is not known at all' if math.isnan(own) else f'to {own:.3g}'}, asked for is "
+            f"{asked:.3g}"
+            for name, own, asked in parts
+            if asked < math.inf and not own <= asked
+        ]
+        if not unknown:
+            return ""
+        return (
+            f"The reference itself knows {'; '.join(unknown)}: what is within that of it may be "
+            "further from the truth. Allow more seconds, give a scene with finer cells, or ask "
+            "for less."
+        )
 
 
 def carried(problem: Problem, x: NDArray[np.float64]) -> Design:
     """A design of one problem as one for all others, by `Problem.transfer`."""
+    x = np.array(x)
     return lambda there: there.transfer(problem, x)
 
 
@@ -354,6 +397,7 @@ def cheapest(
     gradient_tolerance: float | None = None,
     seconds: float = 60.0,
     progress: Callable[[Evidence], None] | None = None,
+    kind: type[Problem] = Problem,
 ) -> Cheapest:
     """The cheapest discretisation whose objective and gradient are within a tolerance.
 
@@ -362,8 +406,8 @@ def cheapest(
     in order of their work, particles times steps, until one is within the tolerance and its
     neighbour with the next finer cells is too, so that no error that only happens to vanish is
     taken for accuracy. What would be redone with half the step counts as failed. Single precision
-    is tried where double suffices; one half is simulated where scene and design are symmetric. The
-    filter keeps the scene's length.
+    is tried where double suffices, and taken where it took less time; one half is simulated where
+    scene and design are symmetric. The filter keeps the scene's length.
 
     Parameters
     ----------
@@ -380,6 +424,8 @@ def cheapest(
         Processor time that the reference may take.
     progress : callable, optional
         Called with each line of evidence.
+    kind : type, optional
+        Class of the problem, should it have an objective of its own.
 
     Returns
     -------
@@ -388,16 +434,18 @@ def cheapest(
     Raises
     ------
     DesignError
-        If the design does not fit, a tolerance is not above zero, or no reference can be had.
+        If the design does not fit, a tolerance or `seconds` is not above zero, or no reference can
+        be had.
     """
     tolerance = number("cheapest", "tolerance", tolerance, above=0.0, error=DesignError)
-    if gradient_tolerance is None:
-        gradient_tolerance = tolerance
-    elif not gradient_tolerance > 0.0:
-        raise DesignError(f"cheapest: gradient_tolerance = {gradient_tolerance!r} must be above 0")
+    gradient_tolerance = _limit(
+        "gradient_tolerance", tolerance if gradient_tolerance is None else gradient_tolerance
+    )
+    seconds = _limit("seconds", seconds)
     if not callable(design):
-        design = carried(Problem(scene, beta, leave_out=leave_out), design)
-    plane = symmetry(scene, design, beta)
+        design = carried(kind(scene, beta, leave_out=leave_out), design)
+    # Half a body is the same solution, but another objective may not be symmetric.
+    plane = symmetry(scene, design, beta) if kind is Problem else scene.mirror
     scene = replace(scene, filter_length=filter_reach(scene))
     grid = _candidates(scene, plane)
     patch = max(scene.grid.size[0] / item.cells[0] for item in grid.values())
@@ -405,7 +453,9 @@ def cheapest(
 
     def result(item: Discretisation) -> Measured:
         if item not in found:
-            found[item] = measure(scene, item, design, beta, patch, leave_out=leave_out, redo=1)
+            found[item] = measure(
+                scene, item, design, beta, patch, leave_out=leave_out, redo=1, kind=kind
+            )
         return found[item]
 
     own = Discretisation.of(scene, mirror=plane)
@@ -459,7 +509,7 @@ def cheapest(
         if within(item) and (not finer or within(grid[min(finer)])):
             best = item
     single = replace(best, precision="single")
-    if within(single):
+    if within(single) and result(single).seconds < result(best).seconds:
         best = single
     if plane is not None and scene.mirror is None:
         within(replace(best, mirror=None))
@@ -469,7 +519,16 @@ def cheapest(
         rows[coarser].objective_error if coarser else math.nan,
         rows[coarser].gradient_error if coarser else math.nan,
         tuple(rows.values()),
+        tolerance,
+        gradient_tolerance,
     )
+
+
+def _limit(name: str, value: Any) -> float:
+    """A number above zero, or infinity for no limit."""
+    if isinstance(value, float) and value == math.inf:
+        return math.inf
+    return number("cheapest", name, value, above=0.0, error=DesignError)
 
 
 def filter_reach(scene: Scene) -> float:

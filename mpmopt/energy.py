@@ -17,6 +17,8 @@ LOOK = 64
 # Between two looks at an actuator, its signal changes by so much of its greatest size at most; with
 # the mean signal, its work is known to the square of that over twelve.
 SIGNAL_CHANGE = 0.2
+# Units in the last place that energies of few particles are off by, several times.
+ROUNDING = 32.0
 
 
 @njit(**OPTIONS)
@@ -119,7 +121,7 @@ class Balance:
         modulus = float((body.volume.real * (body.lame_lambda.real + 2 * body.lame_mu.real)).sum())
         weight = float(body.mass.real.sum()) * math.hypot(world.gravity_x, world.gravity_y)
         height = world.dx * max(world.nodes_x, world.nodes_y)
-        self._rounding = float(np.finfo(signal.dtype).eps) * (modulus + weight * height)
+        self._rounding = ROUNDING * float(np.finfo(signal.dtype).eps) * (modulus + weight * height)
 
     def follow(self, states: NDArray, first: int, last: int) -> None:
         """Take in steps `first` to `last`, whose states are in slots 0, 1, ..."""

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from mpmopt.checks import digits
 from mpmopt.errors import DesignError
+from mpmopt.particles import own
 from mpmopt.problem import Problem
 from mpmopt.scene import Scene
 
@@ -103,6 +104,9 @@ class Candidate(Iteration):
     x: NDArray[np.float64]
     gamma: NDArray[np.float64]
 
+    def __post_init__(self) -> None:
+        own(self, "x", "gamma")
+
 
 @dataclass
 class Leg:
@@ -159,6 +163,9 @@ class StageState:
     farthest: Candidate | None
     farthest_gradient: NDArray[np.float64]
     mma: Mapping[str, Any]
+
+    def __post_init__(self) -> None:
+        own(self, "values", "gradient", "farthest_gradient")
 
 
 @dataclass(repr=False)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from mpmopt.binary import full_block, kept, solid_body
 from mpmopt.objective import Objective
+from mpmopt.particles import own
 from mpmopt.problem import Problem
 from mpmopt.scene import Mirror, Scene
 from mpmopt.simulate import Simulation
@@ -41,11 +42,16 @@ class Body:
         Of N particles.
     gamma : (N,) array
         Their material density.
+    objective : Objective
     """
 
     name: str
     simulation: Simulation
     gamma: NDArray[np.float64]
+    objective: Objective
+
+    def __post_init__(self) -> None:
+        own(self, "gamma")
 
 
 def optimised(problem: Problem, x: NDArray[np.float64]) -> Body:
@@ -53,7 +59,8 @@ def optimised(problem: Problem, x: NDArray[np.float64]) -> Body:
     gamma = np.ones(len(problem.particles.position))
     gamma[problem.particles.designed] = problem.gamma(x)
     present = problem.present(problem.split(x).phi)
-    return Body("optimised design", problem.simulation(x), gamma[present])
+    simulation = problem.simulation(x)
+    return Body("optimised design", simulation, gamma[present], problem.objective(simulation))
 
 
 def post_processed(problem: Problem, x: NDArray[np.float64]) -> Body:
@@ -71,7 +78,8 @@ def reference(problem: Problem, x: NDArray[np.float64]) -> Body:
 def solid(name: str, problem: Problem, x: NDArray[np.float64], keep: NDArray[np.bool_]) -> Body:
     """The body of which only the design particles in `keep` (D,) are there, all of them solid."""
     simulation, _ = solid_body(problem.scene, keep, problem.split(x))
-    return Body(name, simulation, np.ones(len(simulation.particles.position)))
+    gamma = np.ones(len(simulation.particles.position))
+    return Body(name, simulation, gamma, problem.objective(simulation))
 
 
 @dataclass(frozen=True)
@@ -119,16 +127,15 @@ class Motion:
             As `Simulation.run` does.
         """
         simulation, gamma = body.simulation, body.gamma
-        scene, frames = simulation.scene, np.asarray(frames)
+        scene, frames = simulation.scene, np.array(frames)
         transient = scene.transient_steps
         wanted = sorted({*map(int, frames), transient})
         found = dict(zip(wanted, simulation.run(wanted)))
         states = np.array([found[int(frame)] for frame in frames])
         settled = found[transient] if transient else None
-        objective = Objective.of(simulation.particles, scene.direction)
         actuator = simulation.particles.actuator
         counted = (found[max(int(frame), transient)] for frame in frames)
-        values = [float(objective.value(state, settled)) for state in counted]
+        values = [float(body.objective.value(state, settled)) for state in counted]
         if scene.mirror is not None:
             states = np.array([with_image(state, scene.mirror) for state in states])
             gamma, actuator = np.tile(gamma, 2), np.tile(actuator, 2)

@@ -231,7 +231,10 @@ def report(rows: Sequence[dict[str, Any]]) -> str:
     }
     lines = ["  ".join(heading for heading, _ in columns.values())]
     for row in rows:
-        cells = (form(row[name]).rjust(len(head)) for name, (head, form) in columns.items())
+        cells = (
+            ("-" if row[name] != row[name] else form(row[name])).rjust(len(head))
+            for name, (head, form) in columns.items()
+        )
         lines.append("  ".join(cells))
     for name in ("gain", "audited_gain"):
         values = [row[name] for row in rows if math.isfinite(row[name])]
@@ -242,8 +245,9 @@ def report(rows: Sequence[dict[str, Any]]) -> str:
                 f"{_length(middle)}, standard deviation {_length(float(np.std(values)))}"
             )
     best = best_of(rows)
-    gain = _length(best["audited_gain"])
-    lines.append(f"best after its audit: start-{best['start']}, gain {gain}")
+    gain = best["audited_gain"]
+    found = f"gain {_length(gain)}" if math.isfinite(gain) else "which has no audited gain"
+    lines.append(f"best after its audit: start-{best['start']}, {found}")
     return "\n".join(lines)
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mpmopt.particles import Particles
+from mpmopt.particles import Particles, own
 
 
 @dataclass(frozen=True)
@@ -31,6 +31,9 @@ class Objective:
     direction: NDArray[np.float64]
     weight: NDArray[np.float64]
     start: float
+
+    def __post_init__(self) -> None:
+        own(self, "direction", "weight")
 
     @classmethod
     def of(cls, particles: Particles, direction: tuple[float, float]) -> Objective:

@@ -540,7 +540,7 @@ class _StageRun:
             beta=self.stage.beta,
             time_step=time_step,
             move_limit=self.mma.move_limit,
-            x=x.copy(),
+            x=x,
             gamma=gamma,
             objective=value,
             greyness=greyness(gamma),

@@ -3,12 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from mpmopt.scene import Actuator, Design, Scene
+
+
+def own(owner: Any, *names: str) -> None:
+    """Replace arrays of a frozen dataclass by copies that nobody can write to."""
+    for name in names:
+        array = np.array(getattr(owner, name))
+        array.setflags(write=False)
+        object.__setattr__(owner, name, array)
 
 
 @dataclass(frozen=True)
@@ -30,6 +39,9 @@ class Particles:
     volume: NDArray[np.float64]
     designed: NDArray[np.bool_]
     actuator: NDArray[np.int64]
+
+    def __post_init__(self) -> None:
+        own(self, "position", "volume", "designed", "actuator")
 
     def subset(self, keep: NDArray[np.bool_]) -> Particles:
         """The particles that `keep` (N,) marks, in the same order."""

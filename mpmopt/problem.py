@@ -189,7 +189,7 @@ class Problem:
             If x has another size, or an entry is not finite or outside [-1, 1].
         """
         x = _array("x", x)
-        x = x if x.dtype == complex else _real("x", x)
+        x = x.copy() if x.dtype == complex else _real("x", x)
         if x.shape != (self.size,):
             raise DesignError(
                 f"x has shape {x.shape}, this problem's variables {(self.size,)}; Problem.join "
@@ -239,7 +239,10 @@ class Problem:
         )
 
     def objective(self, simulation: Simulation) -> Objective:
-        """How far the body of one of this problem's simulations goes."""
+        """How far the body of a simulation goes: of this problem's, or of a solid one of its scene.
+
+        What pictures, post-processing and audits measure too, should a subclass have another.
+        """
         return Objective.of(simulation.particles, self.scene.direction)
 
     def at(self, time_step: float) -> Problem:

@@ -164,9 +164,6 @@ class Simulation:
             state = np.zeros((mpm.STATE_SIZE, count))
             state[0:2] = particles.position.T
             state[8] = state[11] = 1.0
-        dtype = np.result_type(density, lame_lambda, lame_mu, signal, state, float)
-        if precision == "single" and dtype.kind == "f":
-            dtype = np.dtype(np.float32)
         shapes = {
             "density": (density, (count,)),
             "lame_lambda": (lame_lambda, (count,)),
@@ -177,10 +174,18 @@ class Simulation:
         for name, (array, shape) in shapes.items():
             if np.shape(array) != shape:
                 raise DesignError(f"{name} has shape {np.shape(array)}, must have {shape}")
+            kind = np.asarray(array).dtype
+            if kind.kind not in "fciu":
+                raise DesignError(f"{name} holds {kind}, must hold numbers")
+            if np.ma.is_masked(array):
+                raise DesignError(f"{name} has masked entries, which have no value; fill them")
             if not np.all(np.isfinite(array)):
                 raise DesignError(f"{name} holds {np.sum(~np.isfinite(array))} values not finite")
         if count == 0:
             raise DesignError("the body has no particles")
+        dtype = np.result_type(density, lame_lambda, lame_mu, signal, state, float)
+        if precision == "single" and dtype.kind == "f":
+            dtype = np.dtype(np.float32)
         if not np.real(density).min() > 0.0:
             raise DesignError(f"density {np.real(density).min():g} must be above 0")
         real = np.empty(0, dtype).real.dtype
@@ -203,8 +208,8 @@ class Simulation:
                 0, -(-count // 4), min(max(count // BLOCK, 1), BLOCKS) + 1, dtype=np.int64
             ),
         )
-        self.signal = np.ascontiguousarray(signal, dtype=dtype)
-        self.initial = np.ascontiguousarray(state, dtype=dtype)
+        self.signal = np.array(signal, dtype=dtype, order="C")
+        self.initial = np.array(state, dtype=dtype, order="C")
 
     def run(self, frames: Sequence[int] | None = None) -> NDArray:
         """Run forward and keep nothing.
@@ -224,8 +229,13 @@ class Simulation:
             If a particle leaves the grid, inverts, or is not a number.
         """
         wanted = [self.scene.steps] if frames is None else list(frames)
-        if wanted != sorted(wanted) or (wanted and not 0 <= wanted[0] <= wanted[-1] <= self.steps):
-            raise DesignError(f"frames must increase from 0 to {self.steps}, got {wanted}")
+        whole = all(isinstance(frame, (int, np.integer)) for frame in wanted)
+        ends = [0, *wanted, self.steps]
+        if not whole or ends != sorted(ends):
+            raise DesignError(
+                f"frames must be whole numbers that increase from 0 to {self.steps}, got "
+                f"{shown(wanted)}"
+            )
         memory = _Segment(self, 1, Memory())
         states = memory.states
         states[0] = mpm.grouped(self.initial)
@@ -290,7 +300,7 @@ class Simulation:
         most = (self.world.nodes_x, self.world.nodes_y)
 
         def nodes(first: int, last: int) -> int:
-            cells = np.minimum(np.ptp(position[:, first:last], axis=1) / self.world.dx, most)
+            cells = np.fmin(np.ptp(position[:, first:last], axis=1) / self.world.dx, most)
             return int(np.prod(np.ceil(1.25 * cells) + 4))
 
         first = 4 * self.body.first
@@ -410,6 +420,7 @@ class Memory:
 
     def __init__(self) -> None:
         self._buffers: dict[str, NDArray[np.uint8]] = {}
+        self.runs = 0  # that it was given to
 
     def take(self, name: str, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray:
         """An array with any content, in the place of the last one of that name."""
@@ -431,6 +442,8 @@ class _Segment:
 
     def __init__(self, simulation: Simulation, length: int, memory: Memory) -> None:
         self.simulation, self.memory = simulation, memory
+        memory.runs += 1
+        self.run = memory.runs
         groups, dtype = simulation.body.mass.shape[0], simulation.initial.dtype
         states = (length + 1, mpm.STATE_SIZE * groups, 4)
         self.states = memory.take("states", states, dtype)
@@ -582,12 +595,15 @@ class Forward:
         Raises
         ------
         DesignError
-            If called a second time: going back overwrites what it needs.
+            If called a second time, as going back overwrites what it needs; or if another run was
+            given the same memory meanwhile.
         StorageError
             If a checkpoint cannot be read back.
         """
         if self._reversed:
             raise DesignError("this run was gone back through already; run forward again")
+        if self._memory.memory.runs != self._memory.run:
+            raise DesignError("another run took this one's memory; give each run its own")
         self._reversed = True
         simulation, memory = self._simulation, self._memory
         schedule = self._checkpoints.schedule

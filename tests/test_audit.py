@@ -5,13 +5,16 @@ import dataclasses
 import numpy as np
 import pytest
 from climber import climber
-from conftest import small_scene
+from conftest import SHORT, small_scene
 from crawler import crawler
 from walker import slanted_legs, walker
 
+from mpmopt import runfile
+from mpmopt.__main__ import main
 from mpmopt.audit import audit, refined
-from mpmopt.binary import distance
+from mpmopt.binary import distance, share_kept
 from mpmopt.errors import SceneError
+from mpmopt.optimize import optimise
 from mpmopt.particles import lay_out
 from mpmopt.problem import Problem
 from mpmopt.scene import Actuator
@@ -76,3 +79,22 @@ def test_a_wide_filter_is_no_obstacle_to_finer_cells():
     with pytest.raises(SceneError, match="shorter filter_length"):
         dataclasses.replace(refined(scene), filter_length=scene.filter_length)
     assert refined(scene).grid.cells == (256, 256)
+
+
+def test_no_share_of_a_gain_that_is_rounding(tmp_path, capsys):
+    """A body without design is the full block itself: nothing is gained, and nothing kept."""
+    for kept, gain in ((0.0, 0.0), (3e-17, 1e-17), (1e-17, -1e-17), (0.1, -0.1)):
+        assert np.isnan(share_kept(small_scene(), kept, gain))
+    assert share_kept(small_scene(), 0.05, 0.1) == 0.5
+    c = 1 / 16
+    scene = small_scene(steps=5, body=(Actuator((3 * c, 5 * c), (6 * c, 7 * c)),))
+    x = Problem(scene).join(np.empty(0), 0.2, 0.1, 0.1)
+    path = tmp_path / "run.h5"
+    runfile.write(path, optimise(scene, SHORT, x))
+    for name in ("postprocess", "audit"):
+        assert main([name, str(path)]) == 0
+        said = capsys.readouterr()
+        assert "nan" not in said.out + said.err
+        assert "Warning" not in said.err
+    assert main(["postprocess", str(path)]) == 0
+    assert "share of the gain kept   no gain to keep" in capsys.readouterr().out

@@ -13,6 +13,7 @@ import mpmopt
 from mpmopt.__main__ import main
 from mpmopt.discretisation import (
     Discretisation,
+    Evidence,
     Measured,
     cheapest,
     density,
@@ -24,7 +25,7 @@ from mpmopt.errors import DesignError, SceneError
 from mpmopt.optimize import Settings, Stage, optimise
 from mpmopt.problem import Problem
 from mpmopt.runfile import write
-from mpmopt.scene import Mirror
+from mpmopt.scene import Actuator, Mirror
 
 
 def smooth(problem):
@@ -185,3 +186,73 @@ def test_the_command_prints_evidence_and_what_it_found(tmp_path, capsys):
     printed = capsys.readouterr().out.splitlines()
     assert printed[-1].startswith("cheapest within 1e+09")
     assert sum("within" in line for line in printed[:-1]) >= 2
+    assert main(["cheapest", str(path), "--tol", "1e-9"]) == 0
+    *_, own, best, doubt = capsys.readouterr().out.splitlines()
+    assert own.startswith("its own uncertainty      travel ")
+    assert best.startswith("cheapest near it")
+    assert "asked for is 1e-09" in doubt
+
+
+@pytest.mark.parametrize("seconds", [0.5, 1.1])
+def test_single_precision_is_taken_only_where_it_took_less_time(monkeypatch, seconds):
+    def clocked(*arguments, real=measure, **options):
+        measured = real(*arguments, **options)
+        single = measured.discretisation.precision == "single"
+        return replace(measured, seconds=seconds if single else 1.0)
+
+    monkeypatch.setattr("mpmopt.discretisation.measure", clocked)
+    found = cheapest(small_scene(steps=8), smooth, 1e9)
+    single = {row.measured.discretisation.precision: row for row in found.rows}["single"]
+    assert single.within
+    assert (found.best.precision == "single") == (seconds < 1.0)
+
+
+def test_a_tolerance_below_what_the_reference_knows_is_named():
+    scene = small_scene(steps=8)
+    found = cheapest(scene, smooth, 1e-6)
+    assert found.objective_uncertainty > 1e-6
+    assert f"travel to {found.objective_uncertainty:.3g}, asked for is 1e-06" in found.doubt
+    assert "seconds" in found.doubt
+    assert cheapest(scene, smooth, 1e9).doubt == ""
+    loose = replace(found, tolerance=1e9, gradient_tolerance=math.inf)
+    assert loose.doubt == ""
+    assert "not known at all" in replace(loose, objective_uncertainty=math.nan).doubt
+    only = replace(loose, gradient_uncertainty=math.nan)
+    assert only.doubt == ""  # the gradient may be any
+
+
+def test_evidence_of_a_small_robot_has_its_digits():
+    measured = Measured(Discretisation.of(small_scene()), 1.0, 1.0, 1.2345e-5, np.ones(2))
+    assert "1.234e-05" in str(Evidence(measured, 0.1, 0.1, 1.0, True))
+    assert "nan" not in str(Evidence(measured, 0.1, 0.0, math.nan, True))
+
+
+def test_a_body_that_does_not_travel_is_compared_with_what_rounding_does():
+    here = Discretisation.of(small_scene())
+    still = Measured(here, 1.0, 1.0, 0.0, np.zeros(2), size=1.0)
+    assert still.errors(still)[:2] == (0.0, 0.0)
+    hardly = replace(still, travel=3e-17, gradient=np.array([0.0, 2e-17]))
+    assert max(hardly.errors(still)[:2]) <= 1e-4
+    assert max(still.errors(hardly)[:2]) <= 1e-4
+    goes = replace(still, travel=0.1, gradient=np.array([0.1, 0.0]))
+    assert min(goes.errors(still)[:2]) > 1e9
+    assert replace(goes, size=0.0).errors(replace(still, size=0.0))[:2] == (math.inf, math.inf)
+    body = (Actuator((0.25, 0.25), (0.5, 0.5)),)
+    scene = small_scene(steps=8, body=body, walls=(), gravity=(0.0, 0.0))
+    found = cheapest(scene, lambda problem: problem.join(np.empty(0), 0.0, 0.0, 0.0), 0.1)
+    assert found.best.cells[0] < 16
+    assert found.doubt == ""
+
+
+@pytest.mark.parametrize("value", [math.nan, 0.0, -1.0, "1", None])
+def test_options_that_are_no_limits_are_refused(value):
+    scene = small_scene(steps=2)
+    options = [{"seconds": value}, {"gradient_tolerance": value if value is not None else "x"}]
+    for option in options:
+        with pytest.raises(DesignError, match=next(iter(option))):
+            cheapest(scene, smooth, 0.1, **option)
+    here = Discretisation.of(scene)
+    with pytest.raises(DesignError, match="patch"):
+        measure(scene, here, smooth, 1.0, value)
+    with pytest.raises(DesignError, match="repeats"):
+        measure(scene, here, smooth, 1.0, 1 / 16, repeats=0)

@@ -187,3 +187,19 @@ def test_ellipticity_in_shear_is_lost_where_scenes_say_whatever_the_deformation(
         change = (first_piola(F + wave, sS) - first_piola(F - wave, sS)) / (2.0 * step)
         shear = m @ change @ (F.T @ n)
         assert shear == pytest.approx(n @ F @ (mu * np.eye(2) + sS) @ F.T @ n, abs=1e-6)
+
+
+def test_no_energy_appears_in_a_body_that_hardly_moves():
+    # A few particles at rest, but for rounding: alone, or on a floor under a weight of nothing.
+    c = 1 / 16
+    for width, amplitude, gravity, walls in (
+        (2, 1e-12, 0.0, ()),
+        (3, 0.0, -1e-12, (Wall("y", 4 * c),)),
+        (6, 4e-15, 0.0, ()),
+    ):
+        body = (Actuator((4 * c, 4 * c), ((4 + width / 2) * c, 4.5 * c)),)
+        scene = Scene(Grid((16, 16), c), 1e-3, 200, body, walls, gravity=(0.0, gravity))
+        problem = Problem(scene)
+        for theta in (-0.7, 0.1, 0.4):
+            x = problem.join(np.zeros(0), amplitude, theta, -amplitude)
+            assert margin(problem.simulation(x)) <= 0.2 * LIMITS.energy

@@ -219,3 +219,12 @@ def test_starts_and_scheduler_must_make_sense(tmp_path, capsys, wrong):
     with pytest.raises(SystemExit, match="2"):
         main("A case.", {"default": TINY}, ["--out", str(tmp_path), *wrong])
     assert wrong[0] in capsys.readouterr().err
+
+
+def test_what_is_no_number_is_shown_as_none():
+    without = {**row(0, 0.3, math.nan), "kept_half_step": math.nan}
+    lines = report([without]).splitlines()
+    assert "nan" not in "".join(lines)
+    assert lines[1].count(" -") == 3
+    assert len(lines[0]) == len(lines[1])
+    assert lines[-1] == "best after its audit: start-0, which has no audited gain"

@@ -238,7 +238,7 @@ def test_removing_void_keeps_what_is_above_the_threshold(problem):
     expected = distance(problem.scene, gamma >= 0.3, problem.split(x))
     assert post_processed(problem, x) == expected
     assert post_processed(problem, x, threshold=gamma.min()) != expected
-    for senseless in (0.0, 1.0, 2.0, -0.3, np.nan):
+    for senseless in (0.0, 1.0, 2.0, -0.3, np.nan, "0.3"):
         with pytest.raises(DesignError, match="must be between 0 and 1"):
             post_processed(problem, x, senseless)
     with pytest.raises(DesignError, match=r"\(31,\)"):

@@ -42,7 +42,7 @@ def test_frames_of_one_group_of_particles_are_their_own():
     assert np.all(np.diff(frames[:, 0], axis=0) > 0.0)
 
 
-@pytest.mark.parametrize("frames", [[-1], [41], [3, 2]])
+@pytest.mark.parametrize("frames", [[-1], [41], [3, 2], [1.5], [np.nan], ["1"]])
 def test_frames_outside_the_run_are_refused(scene, frames):
     with pytest.raises(DesignError, match="from 0 to 40"):
         simulation(scene).run(frames)

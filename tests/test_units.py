@@ -165,4 +165,4 @@ def test_a_body_that_cannot_gain_keeps_no_share_of_it(tmp_path, capsys):
     finished(tmp_path / "run.h5", scene)
     capsys.readouterr()
     assert commands.main(["postprocess", str(tmp_path / "run.h5")]) == 0
-    assert "share of the gain kept   none, there is no gain" in capsys.readouterr().out
+    assert "share of the gain kept   no gain to keep" in capsys.readouterr().out

@@ -10,9 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import small_scene
+from fuzz import plausible
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
 from walker import walker
 
+from mpmopt.errors import DesignError, MpmoptError
 from mpmopt.problem import Problem
+from mpmopt.scene import Actuator, Grid, Scene
 from mpmopt.verify import contact_free, dot_product_mismatch, report, taylor_test
 
 ROOT = Path(__file__).parent.parent
@@ -113,3 +118,59 @@ def test_every_wrong_adjoint_fails_every_check_that_can_see_it(verdicts):
 def test_kernels_behave_the_same_without_the_jit():
     done = without_jit("-m", "pytest", "-q", "-p", "no:cacheprovider", "tests/test_mpm.py")
     assert done.returncode == 0, done.stdout
+
+
+def passes(scene, *x, seed=0):
+    """Whether all checks of a scene pass."""
+    problem = Problem(scene)
+    return [c for c in report(problem, problem.join(*x), seed) if not c.passed] == []
+
+
+def block(*size, lower=(4, 4), **changes):
+    """An actuator alone, of so many cells, without walls and gravity."""
+    dx = changes.pop("dx", 1 / 16)
+    upper = [a + b for a, b in zip(lower, size)]
+    body = (Actuator(tuple(dx * k for k in lower), tuple(dx * k for k in upper)),)
+    return small_scene(**{"grid": Grid((16, 16), dx), "body": body, "walls": (), **changes})
+
+
+def test_a_report_passes_whatever_number_of_particles():
+    # No multiple of four: 15 and 1.
+    for size in ((5, 3), (1, 1)):
+        scene = block(*size, particles_per_cell=1, gravity=(0.3, 0.0), steps=5)
+        assert passes(scene, np.zeros(0), 0.9, -0.3, -0.5)
+
+
+@pytest.mark.parametrize("x", [(np.zeros(0), 0.9, -0.3, -0.5), (np.zeros(0), 0.0, 0.0, 0.0)])
+@pytest.mark.parametrize("unit", [1e-3, 1.0, 1e3])
+def test_a_report_passes_where_derivatives_are_zero_by_symmetry(x, unit):
+    # The block stays where it is whatever its actuator does; or nothing moves at all.
+    dx, dt = unit / 16, 4e-3 * unit
+    for changes in ({}, {"transient": 3 * dt}, {"blend_time": 5e-3 * unit}, {"steps": 1}):
+        scene = block(4, 3, dx=dx, gravity=(0.0, 0.0), **{"time_step": dt, "steps": 12, **changes})
+        assert passes(scene, *x)
+
+
+def test_a_report_passes_on_scenes_of_all_kinds():
+    @settings(max_examples=30, deadline=None, database=None, derandomize=True)
+    @given(plausible(), st.sampled_from([0.0, 1e-9, 0.5, 1.0]), st.integers(0, 6))
+    def check(data, size, seed):
+        odd = data["particles_per_cell"] % 2 == 1
+        assume(not odd or data["grid"]["dx"] in (1 / 16, 1.0))  # on the edge of two cells
+        # Signals that the steps resolve.
+        assume(all(r.get("angular_frequency", 0) * data["time_step"] < 3 for r in data["body"]))
+        try:
+            problem = Problem(Scene.from_json(json.dumps(data)), 2.0)
+            x = size * np.random.default_rng(seed).uniform(-1.0, 1.0, problem.size)
+            checks = report(problem, x, seed)
+        except MpmoptError:
+            assume(False)
+        assert [check for check in checks if not check.passed] == []
+
+    check()
+
+
+def test_single_precision_is_not_put_to_the_test():
+    problem = Problem(small_scene(steps=2), precision="single")
+    with pytest.raises(DesignError, match="precision"):
+        report(problem, problem.join(0.0, 0.5, 0.0, 0.0))

@@ -1,0 +1,71 @@
+"""A problem with an objective of its own: all that is given the problem measures that."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import small_scene
+
+from mpmopt import audit, binary, motion
+from mpmopt.discretisation import Discretisation, cheapest, measure
+from mpmopt.motion import Motion
+from mpmopt.objective import Objective
+from mpmopt.problem import Problem
+from mpmopt.verify import report
+
+SCENE = small_scene(steps=16)
+UP = (0.6, 0.8)
+
+
+class Climber(Problem):
+    """Goes another way than its scene says."""
+
+    def objective(self, simulation):
+        return Objective.of(simulation.particles, UP)
+
+
+def smooth(problem):
+    x, y = problem.particles.position[problem.particles.designed].T
+    return problem.join(0.3 * np.sin(40 * x + 25 * y), 0.5, -0.3, -0.5)
+
+
+@pytest.fixture
+def pair():
+    """The subclass, and the same by a scene."""
+    return Climber(SCENE, 2.0), Problem(replace(SCENE, direction=UP), 2.0)
+
+
+def test_bodies_without_void_go_its_way(pair):
+    x = smooth(pair[0])
+    for distance in (binary.post_processed, binary.unactuated, audit.least):
+        own, same = (distance(problem, x) for problem in pair)
+        assert own == same
+    block, split = binary.full_block, pair[0].split(x)
+    own = binary.farthest(SCENE, block, split, objective=pair[0].objective)
+    assert own == binary.farthest(pair[1].scene, block, split)
+
+
+def test_pictures_and_audits_show_it(pair):
+    x = smooth(pair[0])
+    for body in (motion.optimised, motion.post_processed, motion.reference):
+        own, same = (Motion.of(body(problem, x), [0, 8, 16]) for problem in pair)
+        assert np.array_equal(own.objective, same.objective)
+    own, same = (audit.audit(problem, x) for problem in pair)
+    assert [(row.reference, row.distance) for row in own] == [
+        (row.reference, row.distance) for row in same
+    ]
+
+
+def test_checks_and_measurements_are_of_it(pair):
+    x = smooth(pair[0])
+    own, same = (report(problem, x) for problem in pair)
+    assert all(check.passed for check in own)
+    complex_steps = [[c.value for c in checks if "complex" in c.name] for checks in (own, same)]
+    assert complex_steps[0] == complex_steps[1]
+    here = Discretisation.of(SCENE)
+    own = measure(SCENE, here, smooth, 2.0, 1 / 16, kind=Climber)
+    same = measure(pair[1].scene, here, smooth, 2.0, 1 / 16)
+    assert own.travel == same.travel
+    assert np.array_equal(own.gradient, same.gradient)
+    found = cheapest(SCENE, x, 1e9, beta=2.0, kind=Climber, seconds=1e-2)
+    assert found.best in {row.measured.discretisation for row in found.rows}
