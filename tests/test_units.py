@@ -13,7 +13,7 @@ from mpmopt.case import ProgressBar, summarise, table
 from mpmopt.multistart import random_start, report
 from mpmopt.optimize import Settings, Stage, optimise
 from mpmopt.problem import Problem
-from mpmopt.scene import Actuator, Design, Grid
+from mpmopt.scene import Actuator, Grid
 
 # What is a length; the rest has no unit.
 LENGTHS = ("objective", "post_processed", "audited", "projected_gradient")
@@ -157,12 +157,3 @@ def test_what_is_printed_of_several_small_starts_has_digits():
     lines = text.splitlines()
     assert len({len(line) for line in lines[:3]}) == 1
     are_told(text, 6 + 8 + 1)
-
-
-def test_a_body_that_cannot_gain_keeps_no_share_of_it(tmp_path, capsys):
-    body = tuple(part for part in small_scene().body if not isinstance(part, Design))
-    scene = small_scene(steps=20, body=body)
-    finished(tmp_path / "run.h5", scene)
-    capsys.readouterr()
-    assert commands.main(["postprocess", str(tmp_path / "run.h5")]) == 0
-    assert "share of the gain kept   no gain to keep" in capsys.readouterr().out
