@@ -1,5 +1,6 @@
 """Stop rule, move limit and asymptotes, on objectives that are told instead of simulated."""
 
+import copy
 import dataclasses
 import itertools
 
@@ -10,7 +11,7 @@ from conftest import small_scene
 from mpmopt.design import greyness
 from mpmopt.errors import SimulationError
 from mpmopt.mma import MovingAsymptotes
-from mpmopt.optimize import Settings, Stage, optimise
+from mpmopt.optimize import Settings, Stage, begin, go_on, optimise
 from mpmopt.problem import Evaluation, Problem
 from mpmopt.simulate import Margins
 
@@ -27,20 +28,20 @@ def uphill(x):
 
 @pytest.fixture
 def told(monkeypatch):
-    """Runs an optimisation whose evaluations give these objectives; its designs, run and calls."""
+    """Runs an optimisation whose evaluations give these objectives: the run, and its designs."""
 
-    def run(values, settings, gradient=uphill, starts=None, scene=None):
-        left, calls, seen = iter(values), [], []
+    def run(values, settings, gradient=uphill, starts=None, redone=0):
+        left, seen = iter(values), []
 
         def evaluate(problem, x):
-            calls.append((problem.scene.time_step, x.copy()))
             value = next(left)
             if value is FAILS:
                 raise SimulationError("made to fail", 3, 1, (0.0, 0.0), "none")
-            return Evaluation(value, gradient(x), Margins(), problem.scene.time_step)
+            time_step = problem.scene.time_step / 2.0**redone
+            return Evaluation(value, gradient(x), Margins(), time_step, redone)
 
         monkeypatch.setattr(Problem, "evaluate", evaluate)
-        scene = scene or small_scene()
+        scene = small_scene()
         start = Problem(scene).join(0.0, 0.5, -0.3, -0.5) if starts is None else starts
         found = optimise(scene, settings, start, [lambda run: seen.append(run.last)])
         return found, seen[:-1]
@@ -133,7 +134,9 @@ def test_initial_asymptotes_are_sharper_where_the_projection_is(told, sharpen, e
 
 def test_a_first_design_that_fails_is_tried_with_half_the_step(told):
     run, designs = told([FAILS, FAILS, 1.0, 2.0], counted([1.0, 2.0]))
-    assert [item.time_step for item in run.history[2:]] == [1e-3, 1e-3]
+    # A failure's step is that of its last attempt, of two that halve it.
+    assert [item.time_step for item in run.history] == [1e-3, 5e-4, 1e-3, 1e-3]
+    assert [item.redone for item in run.history] == [2, 2, 0, 0]
     assert all(np.array_equal(item.x, designs[0].x) for item in designs[:3])
     assert [item.move_limit for item in run.history] == 4 * [LIMIT]
 
@@ -145,6 +148,8 @@ def test_only_failures_in_a_row_give_up(told):
     assert len(run.history) == len(values)
     assert "gave up after 3 failed evaluations in a row" in run.stop_reason
     assert run.legs[0].gave_up
+    assert run.stop_reason.startswith("Stage 1 of 1 was the last: ")
+    assert run.first.objective == 0.0
 
 
 def stopped_at(values, window, tolerance, least):
@@ -282,3 +287,65 @@ def test_the_result_is_of_the_sharpest_stage_or_counts_most_without_void(told, m
     run, _ = told([8.0, 9.0, 2.0, 3.0], dataclasses.replace(settings, stages=(solid, solid)))
     assert (run.result.stage, run.result.post_processed) == (0, 0.7)
     assert run.best[1].post_processed == 0.6
+
+
+def test_bodies_without_void_are_judged_in_the_step_of_their_evaluation(told, monkeypatch):
+    asked = []
+
+    def judged(problem, x):
+        asked.append(problem.scene.time_step)
+        return 0.1
+
+    monkeypatch.setattr("mpmopt.optimize.post_processed", judged)
+    monkeypatch.setattr("mpmopt.audit.least", judged)
+    stage = dataclasses.replace(STAGE, solid=True, audited=True)
+    settings = dataclasses.replace(COUNTED, stages=(stage,), most_iterations=1)
+    run, _ = told([1.0], settings, redone=2)
+    assert asked == [1e-3, 1e-3]
+    assert run.result.time_step == 1e-3
+
+
+def test_a_design_that_no_audit_saw_is_no_best_however_far_it_goes(told, monkeypatch):
+    # It counts no more than the best, so that it is not audited.
+    monkeypatch.setattr("mpmopt.optimize.post_processed", lambda *_: 0.3)
+    monkeypatch.setattr("mpmopt.audit.least", lambda *_: 0.35)
+    stage = dataclasses.replace(STAGE, solid=True, audited=True)
+    settings = dataclasses.replace(COUNTED, stages=(stage,), most_iterations=2)
+    run, _ = told([1.0, 2.0], settings)
+    assert np.isnan(run.history[1].audited)
+    assert run.result.objective == 1.0
+
+
+# Failures at the start of a stage, in the middle, and in a row.
+WAY = [FAILS, FAILS, 0.0, 1.0, 0.5, 2.0, FAILS, FAILS, 1.5, 3.0, FAILS, FAILS, FAILS, 1.0, 4.0, 2.0]
+
+
+def test_what_was_stopped_anywhere_goes_the_same_way(monkeypatch):
+    settings = Settings(
+        (STAGE, dataclasses.replace(STAGE, beta=32.0)), window=2, tolerance=0.0,
+        least_iterations=1, most_iterations=6, most_failures=3,
+    )  # fmt: skip
+    current = []
+
+    def evaluate(problem, x):
+        value = WAY[len(current[-1].history)]
+        if value is FAILS:
+            raise SimulationError("made to fail", 3, 1, (0.0, 0.0), "none")
+        gradient = np.where(np.arange(x.size) % 2, 1.0, 0.02 - x)
+        return Evaluation(value, gradient, Margins(), problem.scene.time_step)
+
+    monkeypatch.setattr(Problem, "evaluate", evaluate)
+    scene, stops = small_scene(), []
+    current.append(begin(scene, settings, Problem(scene).join(0.0, 0.5, -0.3, -0.5)))
+    whole = go_on(current[-1], [lambda run: stops.append(copy.deepcopy(run))])
+    assert len(whole.history) == 13
+    assert "gave up after 3 failed" in whole.stop_reason
+    for stop in stops[:-1]:
+        stop.history[-1] = dataclasses.replace(stop.history[-1], seconds=1000.0)
+        current.append(stop)
+        again = go_on(stop)
+        assert again.stop_reason == whole.stop_reason
+        assert np.array_equal(again.last.x, whole.last.x)
+        assert again.history[-1].seconds >= 1000.0
+        for one, other in zip(again.history, whole.history, strict=True):
+            assert repr(dataclasses.replace(one, seconds=other.seconds)) == repr(other)

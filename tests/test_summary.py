@@ -202,3 +202,77 @@ def test_pieces_hold_together_over_edges_not_over_corners():
     assert sorted(binary.pieces(SCENE, stairs)[stairs]) == [1, 2, 3]
     row = (j == 0) & (i < 3)
     assert set(binary.pieces(SCENE, row)[row]) == {1}
+
+
+def test_without_actuation_nothing_works_on(monkeypatch):
+    asked = []
+    monkeypatch.setattr(binary, "distance", lambda scene, keep, v: asked.append((keep, v)) or 0.125)
+    x = PROBLEM.join(np.linspace(-1.0, 1.0, 32), 0.5, 0.25, 0.75)
+    assert binary.unactuated(PROBLEM, x) == 0.125
+    ((keep, v),) = asked
+    assert np.array_equal(keep, PROBLEM.gamma(x) >= 0.3)
+    assert (v.a.tolist(), v.theta.tolist(), v.b.tolist()) == ([0.0, 0.0], [0.25, 0.25], [0.0, 0.0])
+
+
+def test_a_reference_takes_the_best_actuation_of_those_that_run(monkeypatch):
+    found = {0.25: 0.1, 0.5: 0.3, 0.75: 0.2}
+
+    def distance(scene, keep, variables):
+        a = float(variables.a[0])
+        if a not in found:
+            raise SimulationError("made to fail", 3, 1, (0.0, 0.0), "none")
+        return found[a]
+
+    monkeypatch.setattr(binary, "distance", distance)
+
+    def farthest(*amplitudes):
+        actuations = [PROBLEM.split(PROBLEM.join(0.0, a, 0.0, 0.0)) for a in amplitudes]
+        return binary.farthest(SCENE, binary.full_block, *actuations)
+
+    assert farthest(0.25, 0.5, 0.75) == 0.3
+    assert farthest(1.0, 0.25) == farthest(0.25, 1.0) == 0.1
+    with pytest.raises(SimulationError, match="made to fail"):
+        farthest(1.0, 0.0)
+
+
+def test_a_distance_after_a_transient_counts_from_there():
+    # The body falls to one side at once.
+    scene = small_scene(steps=6, transient=3 * 4e-3, gravity=(5.0, 0.0), walls=())
+    keep, variables = np.ones(32, dtype=bool), PROBLEM.split(PROBLEM.join(1.0, 0.5, 0.0, 0.0))
+    simulation, objective = binary.solid_body(scene, keep, variables)
+    states = simulation.run([3, 6])
+    settled, end = (objective.value(state) for state in states)
+    expected = objective.start + end - settled
+    assert binary.distance(scene, keep, variables) == pytest.approx(expected, rel=1e-13)
+    assert abs(expected - end) > 1e-6
+
+
+def test_the_presets_are_what_they_say():
+    sharp = case.sharpened(1e-3)
+    assert [stage.beta for stage in sharp.stages] == [0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0]
+    late = [False] * 4 + [True] * 3
+    assert [stage.solid for stage in sharp.stages] == late
+    assert [stage.audited for stage in sharp.stages] == late
+    assert [stage.leave_out > 0.0 for stage in sharp.stages] == late
+    assert (sharp.adapt_move_limit, sharp.sharpen_asymptotes, sharp.best_first) == 3 * (True,)
+
+    fine = case.refined(2e-3, 1e-3)
+    coarse, rest = fine.stages[:5], fine.stages[5:]
+    assert [stage.beta for stage in coarse] == [0.5, 1.0, 2.0, 4.0, 8.0]
+    assert {(stage.coarsening, stage.time_step, stage.audited) for stage in coarse} == {
+        (2, 2e-3, False)
+    }
+    assert [stage.solid for stage in coarse] == 4 * [False] + [True]
+    assert [stage.beta for stage in rest] == [8.0, *4 * [16.0], *3 * [32.0]]
+    assert {(stage.coarsening, stage.time_step, stage.audited, stage.solid) for stage in rest} == {
+        (1, 1e-3, True, True)
+    }
+    assert (fine.scouting, fine.tolerance) == (3, 0.0)
+
+    paper = case.published(1e-3)
+    assert [stage.beta for stage in paper.stages] == [0.5, 1.0, 2.0, 4.0, 8.0, 16.0]
+    assert {(s.mass_floor, s.stiffness_floor, s.move_limit, s.redo) for s in paper.stages} == {
+        (1e-3, 1e-3, 0.5, 0)
+    }
+    assert (paper.adapt_move_limit, paper.sharpen_asymptotes, paper.best_first) == 3 * (False,)
+    assert (paper.window, paper.tolerance) == (10, 2e-4)
