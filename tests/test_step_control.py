@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from conftest import small_scene
 
-from mpmopt.design import greyness
 from mpmopt.errors import SimulationError
 from mpmopt.mma import MovingAsymptotes
 from mpmopt.optimize import Settings, Stage, begin, go_on, optimise
@@ -246,7 +245,6 @@ def test_greyness_in_the_history_is_that_of_the_design(told):
         gamma = problem.gamma(design.x)
         assert np.array_equal(design.gamma, gamma)
         assert item.greyness == pytest.approx(np.mean(4.0 * gamma * (1.0 - gamma)), rel=1e-12)
-    assert greyness(np.full(4, 0.25)) == 0.75
 
 
 def test_starts_are_compared_by_the_last_stage_they_scouted(told):

@@ -153,8 +153,9 @@ def test_a_share_of_the_gain_is_over_the_block_in_the_same_discretisation(monkey
     x = PROBLEM.join(1.0, 0.5, 0.0, 0.0)
     rows = audit.audit(PROBLEM, x)
     assert [row.kept for row in rows] == pytest.approx([1.0, 0.5, -0.25, 1.25])
-    values = iter((0.5, 0.5, 0.2, 0.4, 0.3, 0.2, 0.0, 0.5))
-    assert all(np.isnan(row.kept) for row in audit.audit(PROBLEM, x))
+    for design in (0.5, 0.4):  # no gain, and a loss
+        values = iter((0.5, design, 0.2, 0.4, 0.3, 0.2, 0.0, 0.5))
+        assert all(np.isnan(row.kept) for row in audit.audit(PROBLEM, x))
 
 
 def test_the_least_of_an_audit_is_of_half_the_step_and_half_the_cells(monkeypatch):
