@@ -126,12 +126,12 @@ def test_half_a_body_that_blends_is_the_same_solution_and_its_gradient_is_exact(
     assert max(kernel_mismatches(scene).values()) <= 1e-13
 
 
-def barely_touching(seed, change=0.0):
+def barely_touching(seed, blend_time, change=0.0):
     """A step of particles that end so near the ends of their cells that some nodes get nothing.
 
     Where two such weights meet, a node has 1e-30 of a particle's mass: less than rounding of it.
     """
-    scene = small_scene(walls=(), steps=1)
+    scene = small_scene(walls=(), steps=1, blend_time=blend_time)
     rng = np.random.default_rng(seed)
     particles = lay_out(scene)
     count = len(particles.position)
@@ -147,22 +147,26 @@ def barely_touching(seed, change=0.0):
     return Simulation(scene, particles, ones, 10.0 * ones, 10.0 * ones, signal, state + change)
 
 
-SEEDS = range(30)
+# Of the first hundred, those where such a node would spoil something, compiled or not.
+SEEDS = (31, 41, 49, 54, 59, 65, 71, 91, 100)
 
 
-def test_nodes_with_next_to_no_mass_spoil_no_velocity():
+@pytest.mark.parametrize("blend_time", [0.0, 5e-3])
+def test_nodes_with_next_to_no_mass_spoil_no_velocity(blend_time):
     for seed in SEEDS:
-        simulation = barely_touching(seed)
+        simulation = barely_touching(seed, blend_time)
         expected = step(simulation, simulation.initial, 0)
         assert np.abs(simulation.run() - expected).max() <= 1e-12 * np.abs(expected).max(), seed
 
 
-def test_nodes_with_next_to_no_mass_spoil_no_gradient(rng):
+@pytest.mark.parametrize("blend_time", [0.0, 5e-3])
+def test_nodes_with_next_to_no_mass_spoil_no_gradient(rng, blend_time):
     for seed in SEEDS:
-        simulation = barely_touching(seed)
+        simulation = barely_touching(seed, blend_time)
         bar, direction = rng.standard_normal((2, *simulation.initial.shape))
         with simulation.checkpoints(Checkpointing()) as checkpoints:
             gradient = simulation.forward(checkpoints).reverse(bar).state
-        moved = barely_touching(seed, 1j * COMPLEX_STEP * direction).run().imag / COMPLEX_STEP
+        change = 1j * COMPLEX_STEP * direction
+        moved = barely_touching(seed, blend_time, change).run().imag / COMPLEX_STEP
         terms = np.abs(gradient * direction).sum() + np.abs(bar * moved).sum()
         assert abs((gradient * direction).sum() - (bar * moved).sum()) <= 1e-9 * terms, seed

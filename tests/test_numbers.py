@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 from conftest import small_scene
 
+from mpmopt import mpm
 from mpmopt.actuation import signal
 from mpmopt.checkpoints import Checkpointing, Schedule
 from mpmopt.objective import Objective
-from mpmopt.particles import Particles
+from mpmopt.particles import Particles, lay_out
 from mpmopt.scene import Wall
-from mpmopt.simulate import Margins, world_of
+from mpmopt.simulate import Margins, Simulation, world_of
 
 
 def test_a_signal_is_that_of_the_start_of_each_step():
@@ -83,6 +84,21 @@ def test_margins_of_two_runs_are_the_worse_of_each():
     one = Margins(0.1, 0.9, 0.5, 1.5, 0.0)
     other = Margins(0.2, 0.8, 0.6, 1.25, 0.01)
     assert one.join(other) == other.join(one) == Margins(0.2, 0.9, 0.5, 1.5, 0.01)
+
+
+def test_only_stretched_solid_can_be_torn():
+    scene = small_scene()
+    particles = lay_out(scene)
+    count = len(particles.position)
+    state = np.zeros((12, count))
+    state[0:2] = particles.position.T
+    state[8], state[11] = 1.0, 1.0
+    state[8, :3] = 5.0, 3.0, 2.0
+    mu = np.full(count, scene.material.lame_mu)
+    mu[:2] *= 0.1, 0.49  # void and what is nearly void
+    signal = np.zeros((scene.steps, 2))
+    simulation = Simulation(scene, particles, np.ones(count), mu, mu, signal, state)
+    assert simulation.margins(mpm.grouped(state)).stretch == pytest.approx(2.0)
 
 
 def test_a_schedule_recomputes_nothing_that_it_has():
