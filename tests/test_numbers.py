@@ -1,5 +1,6 @@
 """Signals, objectives, walls and schedules against numbers worked out by hand."""
 
+import contextlib
 import dataclasses
 import math
 
@@ -10,10 +11,12 @@ from conftest import small_scene
 from mpmopt import mpm
 from mpmopt.actuation import signal
 from mpmopt.checkpoints import Checkpointing, Schedule
+from mpmopt.errors import SimulationError
 from mpmopt.objective import Objective
 from mpmopt.particles import Particles, lay_out
+from mpmopt.problem import Problem
 from mpmopt.scene import Wall
-from mpmopt.simulate import Margins, Simulation, world_of
+from mpmopt.simulate import Margins, Simulation, Watched, world_of
 
 
 def test_a_signal_is_that_of_the_start_of_each_step():
@@ -99,6 +102,52 @@ def test_only_stretched_solid_can_be_torn():
     signal = np.zeros((scene.steps, 2))
     simulation = Simulation(scene, particles, np.ones(count), mu, mu, signal, state)
     assert simulation.margins(mpm.grouped(state)).stretch == pytest.approx(2.0)
+
+
+GOOD = Margins(courant=1.0, spin=0.5, jacobian=0.01, stretch=3.0, energy=0.05)  # at the limits
+
+
+@pytest.mark.parametrize(
+    ("over", "tries"),
+    [
+        ({}, 1),
+        ({"courant": 1.01}, 3),
+        ({"spin": 0.51}, 3),
+        ({"jacobian": 0.0099}, 3),
+        ({"energy": 0.051}, 3),
+        ({"stretch": 3.01}, 1),  # no step mends what is torn
+    ],
+)
+def test_what_is_over_a_limit_is_tried_again_unless_it_is_torn_or_left_alone(
+    monkeypatch, over, tries
+):
+    steps = []
+
+    def watch(simulation):
+        steps.append(simulation.scene.time_step)
+        return Watched(simulation.initial, None, GOOD._replace(**over))
+
+    monkeypatch.setattr(Simulation, "watch", watch)
+    scene = small_scene()
+    x = Problem(scene).join(0.0, 0.5, 0.0, 0.0)
+    with pytest.raises(SimulationError) if over else contextlib.nullcontext():
+        Problem(scene).value(x)
+    assert steps == [4e-3, 2e-3, 1e-3][:tries]
+    assert np.isfinite(Problem(scene, redo=0).value(x))
+
+
+def test_a_window_holds_the_mirror_images_of_its_nodes():
+    # Nodes 8 to 12 along x and 3 to 5 along y.
+    windows = np.array([[8, 3, 3, 2], [10, 4, 3, 2]])
+    world = world_of(small_scene())
+
+    def window(axis, node):
+        return mpm.whole_window(windows, world._replace(mirror_axis=axis, mirror_node=node))
+
+    assert window(-1, 0) == (8, 3, 5, 3)
+    assert window(0, 9) == (6, 3, 7, 3)
+    assert window(1, 3) == (8, 1, 5, 5)
+    assert window(0, 11) == window(1, 5) == (8, 3, 5, 3)
 
 
 def test_a_schedule_recomputes_nothing_that_it_has():

@@ -182,8 +182,10 @@ def test_a_design_on_finer_cells_takes_each_particle_from_the_nearest():
     assert there.sum() == 4 * keep.sum()
     position = fine.particles.position[fine.particles.designed]
     coarse = PROBLEM.particles.position[PROBLEM.particles.designed]
-    for point, is_there in zip(position, there):
-        assert is_there == keep[np.hypot(*(coarse - point).T).argmin()]
+    moved = fine.split(fine.transfer(PROBLEM, x)).phi
+    for point, is_there, value in zip(position, there, moved):
+        nearest = np.hypot(*(coarse - point).T).argmin()
+        assert (is_there, value) == (keep[nearest], phi[nearest])
 
 
 def test_what_is_kept_includes_the_threshold():
