@@ -182,6 +182,7 @@ def test_undesigned_particles_are_solid_whatever_the_design(scene):
 def test_greyness():
     assert greyness(np.array([0.0, 1.0])) == 0.0
     assert greyness(np.full(3, 0.5)) == 1.0
+    assert greyness(np.full(3, 0.25)) == 0.75
     assert greyness(np.zeros(0)) == 0.0
 
 
