@@ -760,7 +760,7 @@ def is_behind(i, j, k, world):
 def friction(un, ut, k, world):
     """What an approaching node's tangential velocity becomes at wall k: keep ut + slope un."""
     coefficient = world.wall_friction[k]
-    if abs(ut) <= coefficient * abs(un):
+    if abs(ut) < coefficient * abs(un):  # without friction nothing sticks, at rest either
         return 0.0, 0.0
     return 1.0, np.sign(ut) * coefficient * world.wall_side[k]
 

@@ -109,7 +109,7 @@ def meet_walls(scene: Scene, place: NDArray[np.float64], u: NDArray) -> None:
             sliding = u[1 - normal]
             speed = sliding if sliding.real > 0.0 else -sliding
             left = 0.0 * speed
-            if wall.friction != "stick" and speed.real > wall.friction * approach.real:
+            if wall.friction != "stick" and speed.real >= wall.friction * approach.real:
                 left = speed - wall.friction * approach
             u[1 - normal] = left if sliding.real > 0.0 else -left
             u[normal] = 0.0

@@ -83,6 +83,16 @@ def test_every_branch_of_a_wall_and_of_its_adjoint(rng):
     assert seen == set(itertools.product("xy", ("below", "above"), branches))
 
 
+@pytest.mark.parametrize("axis", ["x", "y"])
+def test_without_friction_nothing_sticks_at_rest_either(axis):
+    # Every body that starts at rest on such a wall asks for this derivative.
+    world = world_with(at(axis, "below", 0.0))
+    rest = (-1.0 + 0.0j, 1j * COMPLEX_STEP)[:: 1 if axis == "x" else -1]
+    along = (0.0, 1.0) if axis == "x" else (1.0, 0.0)
+    assert np.imag(mpm.wall(2, 2, *rest, world)) / COMPLEX_STEP == pytest.approx(along)
+    assert mpm.wall_adjoint(2, 2, *np.real(rest), world, 1.0, 1.0) == along
+
+
 @pytest.mark.parametrize("order", [1, -1])
 def test_two_walls_with_friction_meet_in_a_corner_one_after_the_other(rng, order):
     seen = set()
