@@ -287,7 +287,7 @@ def test_kernels_come_from_the_cache_to_the_same_bits_but_never_once_edited(tmp_
     assert warm == cold
     kernels = tmp_path / "mpmopt" / "mpm.py"
     text = kernels.read_text()
-    gravity = "grid[0, node, 0] * per_m + world.dt * world.gravity_x\n"
+    gravity = "fused(grid[0, node, 0], per_m, world.dt * world.gravity_x),\n"
     assert text.count(gravity) == 1
     kernels.write_text(text.replace(gravity, gravity.replace("world.dt *", "2.0 * world.dt *")))
     edited, *_ = start_up(tmp_path, FALL, tmp_path)

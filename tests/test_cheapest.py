@@ -25,7 +25,7 @@ from mpmopt.errors import DesignError, SceneError
 from mpmopt.optimize import Settings, Stage, optimise
 from mpmopt.problem import Problem
 from mpmopt.runfile import write
-from mpmopt.scene import Actuator, Mirror
+from mpmopt.scene import Actuator, Mirror, Wall
 
 
 def smooth(problem):
@@ -146,7 +146,7 @@ def test_evidence_adds_up(tolerance, gradient_tolerance):
 
 
 def test_the_loosest_tolerance_takes_the_cheapest_and_the_tightest_the_reference():
-    scene = small_scene()
+    scene = small_scene(walls=(Wall("y", 4 / 16, friction=0.3),))  # on a line of coarser grids too
     problem = Problem(scene, 2.0)
     x = smooth(problem)
     loose = mpmopt.cheapest(scene, x, 1e9, beta=2.0)

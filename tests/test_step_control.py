@@ -192,7 +192,7 @@ def test_the_moving_average_stops_a_stage_where_the_paper_says(told, name):
 
 def test_the_stop_rule_of_the_paper_is_the_default():
     settings = Settings((STAGE,))
-    assert (settings.window, settings.tolerance, settings.least_iterations) == (10, 2e-4, 20)
+    assert (settings.window, settings.tolerance, settings.least) == (10, 2e-4, 20)
 
 
 def test_the_stop_rule_counts_what_succeeded_and_each_stage_for_itself(told):

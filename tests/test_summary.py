@@ -161,7 +161,7 @@ def test_a_share_of_the_gain_is_over_the_block_in_the_same_discretisation(monkey
 def test_the_least_of_an_audit_is_of_half_the_step_and_half_the_cells(monkeypatch):
     asked = []
 
-    def distance(scene, keep, variables):
+    def distance(scene, keep, variables, objective):
         asked.append((scene.time_step, scene.steps, scene.grid.cells, keep.size))
         return values[len(asked) % 2]
 
@@ -209,7 +209,9 @@ def test_pieces_hold_together_over_edges_not_over_corners():
 
 def test_without_actuation_nothing_works_on(monkeypatch):
     asked = []
-    monkeypatch.setattr(binary, "distance", lambda scene, keep, v: asked.append((keep, v)) or 0.125)
+    monkeypatch.setattr(
+        binary, "distance", lambda scene, keep, v, _: asked.append((keep, v)) or 0.125
+    )
     x = PROBLEM.join(np.linspace(-1.0, 1.0, 32), 0.5, 0.25, 0.75)
     assert binary.unactuated(PROBLEM, x) == 0.125
     ((keep, v),) = asked
@@ -220,7 +222,7 @@ def test_without_actuation_nothing_works_on(monkeypatch):
 def test_a_reference_takes_the_best_actuation_of_those_that_run(monkeypatch):
     found = {0.25: 0.1, 0.5: 0.3, 0.75: 0.2}
 
-    def distance(scene, keep, variables):
+    def distance(scene, keep, variables, objective):
         a = float(variables.a[0])
         if a not in found:
             raise SimulationError("made to fail", 3, 1, (0.0, 0.0), "none")
