@@ -107,9 +107,10 @@ def kept(problem: Problem, x: NDArray, threshold: float = THRESHOLD) -> NDArray[
     DesignError
         If x does not fit, or the threshold is not between 0 and 1.
     """
-    kinds = (int, float, np.integer, np.floating)
-    if not isinstance(threshold, kinds) or not 0.0 < threshold < 1.0:
-        raise DesignError(f"threshold = {shown(threshold)} must be between 0 and 1")
+    is_number = isinstance(threshold, (int, float, np.integer, np.floating))
+    if not is_number or not 0.0 < threshold < 1.0:
+        said = f"{threshold:g}" if is_number else shown(threshold)
+        raise DesignError(f"threshold = {said} must be between 0 and 1")
     return problem.gamma(x) >= threshold
 
 
