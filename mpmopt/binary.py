@@ -130,7 +130,13 @@ def post_processed(problem: Problem, x: NDArray, threshold: float = THRESHOLD) -
 
 def share_kept(scene: Scene, kept: float, gain: float) -> float:
     """Share of a gain that is kept; not a number if there was none beyond rounding."""
-    return kept / gain if gain > NO_GAIN * max(scene.grid.size) else float("nan")
+    gain = beyond_rounding(scene, gain)
+    return kept / gain if gain > 0.0 else float("nan")
+
+
+def beyond_rounding(scene: Scene, gain: float) -> float:
+    """A gain, or zero if it is no more than rounding of positions."""
+    return 0.0 if abs(gain) <= NO_GAIN * max(scene.grid.size) else gain
 
 
 def unactuated(problem: Problem, x: NDArray) -> float:

@@ -347,7 +347,9 @@ def summarise(result: Optimisation, drawing: Mapping[int, NDArray[np.bool_]]) ->
         "post_processed_half_step": _number_or_none(audits[1].distance),
         # Over the full block where it goes farther: as designed, or as in the row.
         "gain": {
-            row.name: _number_or_none(row.distance - np.fmax(row.reference, block))
+            row.name: _number_or_none(
+                binary.beyond_rounding(problem.scene, row.distance - np.fmax(row.reference, block))
+            )
             for row in audits
         },
         "gain_kept": {row.name: _number_or_none(row.kept) for row in others},
@@ -401,6 +403,12 @@ def draw_or_warn(path: Path, draw: Callable[[Path], None]) -> None:
         logger.warning("no %s: %s: %s", path.name, type(error).__name__, reason)
 
 
+def _shown(value: Any) -> str:
+    if value is None:
+        return "-"
+    return digits(value) if isinstance(value, float) else str(value)
+
+
 def table(summary: Mapping[str, Any]) -> str:
     """The summary as aligned text."""
     flat: dict[str, Any] = {}
@@ -413,7 +421,7 @@ def table(summary: Mapping[str, Any]) -> str:
     lines = []
     for name, value in flat.items():
         values = value if isinstance(value, list) else [value]
-        shown = ", ".join(digits(v) if isinstance(v, float) else str(v) for v in values)
+        shown = ", ".join(_shown(v) for v in values)
         lines.append(f"{name.replace('_', ' '):<{width}}  {shown}")
     return "\n".join(lines)
 

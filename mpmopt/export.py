@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import logging
+import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from importlib import import_module
@@ -55,7 +56,7 @@ class Exported:
 def export(
     problem: Problem,
     x: NDArray[np.float64],
-    out: Path,
+    out: str | os.PathLike[str],
     formats: Iterable[str],
     *,
     width: float | None = None,
@@ -73,7 +74,7 @@ def export(
     ----------
     problem : Problem
     x : (n,) array
-    out : Path
+    out : path
         Folder, made if it is not there. Older exports in it are replaced.
     formats : iterable of str
         "svg", "dxf", "stl" (which need a size) and "vtk" (the motion, in the scene's units).
@@ -101,7 +102,7 @@ def export(
     StorageError
         If the folder, or no file, can be written.
     """
-    formats = list(formats)
+    formats, out = list(formats), Path(out)
     unknown = [name for name in formats if name not in FILES]
     if unknown or not formats:
         what = f"formats {unknown} are unknown" if unknown else "no format is asked for"

@@ -20,7 +20,7 @@ logger = logging.getLogger(__name__)
 MARK, HEAD = "made by mpmopt", 1_000_000
 
 
-def replace_file(path: Path, content: bytes) -> None:
+def replace_file(path: str | os.PathLike[str], content: bytes) -> None:
     """Write a file that is complete or absent; an older one stays until the new one is complete.
 
     Raises
@@ -28,6 +28,7 @@ def replace_file(path: Path, content: bytes) -> None:
     StorageError
         If it cannot be written.
     """
+    path = Path(path)
     new = path.with_name(f"{_unfinished(path)}{uuid4().hex}")
     try:
         with new.open("xb") as file:

@@ -291,8 +291,10 @@ def refuse_unfit(scene: Scene) -> None:
     SceneError
         If nothing actuates it, any stretch tears it, or it is in several pieces.
     """
-    if not scene.actuators:
-        raise SceneError("optimise: the body has no Actuator, so it does not go by itself; add one")
+    if not any(np.any(actuator.stress) for actuator in scene.actuators):
+        raise SceneError(
+            "optimise: the body has no Actuator with a stress, so it does not go by itself; add one"
+        )
     if scene.particles_per_cell == 1:
         raise SceneError(
             "optimise: particles_per_cell = 1 leaves a cell without a particle at any stretch, and "
@@ -308,7 +310,7 @@ def refuse_unfit(scene: Scene) -> None:
     gap, region, other = min(
         ((scene.gap(a, b) or 0.0, a, b) for a in apart for b in held), key=lambda item: item[0]
     )
-    how = f"ends {gap:.4g} ({gap / scene.grid.dx:.4g} cells) before" if gap else "only touches"
+    how = f"is {gap:.4g} ({gap / scene.grid.dx:.4g} cells) from" if gap else "only touches"
     raise SceneError(
         f"optimise: the body is in pieces: {region} {how} {other}{'' if gap else ' at a corner'}; "
         "let them share an edge, or put a Design or a Solid between them"

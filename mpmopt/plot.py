@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -31,7 +32,7 @@ logger = logging.getLogger(__name__)
 
 
 @own_style()
-def plot_motion(path: Path, body: Body, pictures: int = 8) -> None:
+def plot_motion(path: str | os.PathLike[str], body: Body, pictures: int = 8) -> None:
     """Write a PNG of a body at equal intervals from start to end.
 
     Parameters
@@ -70,7 +71,7 @@ def plot_motion(path: Path, body: Body, pictures: int = 8) -> None:
 
 
 @own_style()
-def plot_history(path: Path, run: Optimisation) -> None:
+def plot_history(path: str | os.PathLike[str], run: Optimisation) -> None:
     """Write a PNG of objective, beta and greyness over a run's evaluations, stages marked.
 
     Raises

@@ -251,7 +251,8 @@ def read(path: str | os.PathLike[str]) -> RunFile:
     path = place("runfile.read", "path", path)
     with refusing(path, "run file", RunFileError):
         if not path.is_file():
-            raise RunFileError(f"{path} is not there; give the path of a run.h5")
+            what = "is no file" if path.exists() else "is not there"
+            raise RunFileError(f"{path} {what}; give the path of a run.h5")
         with unsealed(path, "run file") as file:
             return _read(file, path)
 

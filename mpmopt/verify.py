@@ -78,7 +78,9 @@ def dot_product_mismatch(
     difference = abs(sum(map(np.sum, left)) - sum(map(np.sum, right)))
     # Not that of the sums: these may vanish by chance.
     size = sum(float(np.linalg.norm([np.linalg.norm(term) for term in s])) for s in (left, right))
-    return float(difference / size) if difference > 0.0 else 0.0
+    if not np.isfinite(difference):
+        return float("inf")  # what is not a number fits nothing
+    return float(difference / size) if size > 0.0 else 0.0
 
 
 def _size(values: NDArray) -> float:
@@ -653,7 +655,8 @@ def _taylor_check(problem: Problem, x: NDArray[np.float64], direction: NDArray) 
     clear = np.flatnonzero(taylor.remainder[1:] > rounding)
     if not clear.size:
         largest = float(taylor.remainder[1:].max())
-        return Check("Taylor remainder, contact-free", largest, f"<= {rounding:.2g}", True)
+        passed = largest <= rounding  # what is not a number is not
+        return Check("Taylor remainder, contact-free", largest, f"<= {rounding:.2g}", passed)
     order = float(taylor.order[clear[-1]])
     passed = abs(order - 2.0) <= ORDER_TOLERANCE
     return Check("Taylor order, contact-free", order, f"2 +- {ORDER_TOLERANCE:g}", passed)

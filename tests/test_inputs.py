@@ -166,7 +166,7 @@ LOOSE = Solid((6 * C, 7.5 * C), (7 * C, 8 * C))
     [
         (
             pieces(Actuator((10 * C, 4 * C), (12 * C, 5 * C)), DESIGN),
-            ["Design (0.1875, ", "ends 0.3125 (5 cells) before Actuator (0.625, ", "an edge"],
+            ["Design (0.1875, ", "is 0.3125 (5 cells) from Actuator (0.625, ", "an edge"],
         ),
         (
             pieces(DESIGN, Actuator((5 * C, 6 * C), (6 * C, 7 * C))),
@@ -174,11 +174,15 @@ LOOSE = Solid((6 * C, 7.5 * C), (7 * C, 8 * C))
         ),
         (
             pieces(DESIGN, Actuator((3 * C, 6 * C), (5 * C, 7 * C)), LOOSE),
-            ["Solid (0.375, 0.46875)", "ends 0.06988 (1.118 cells) before Actuator"],
+            ["Solid (0.375, 0.46875)", "is 0.06988 (1.118 cells) from Actuator"],
         ),
         (pieces(DESIGN, Actuator((3 * C, 6.5 * C), (5 * C, 7 * C))), ["0.03125 (0.5 cells)"]),
         (small_scene(steps=4, particles_per_cell=1), ["particles_per_cell = 1", "2 or more"]),
         (pieces(DESIGN, Solid((3 * C, 6 * C), (5 * C, 7 * C))), ["no Actuator", "add one"]),
+        (
+            pieces(DESIGN, Actuator((3 * C, 6 * C), (5 * C, 7 * C), stress=((0, 0), (0, 0)))),
+            ["no Actuator with a stress"],
+        ),
     ],
 )
 def test_a_body_that_makes_no_robot_can_be_simulated_but_not_optimised(tmp_path, scene, says):

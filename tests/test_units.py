@@ -8,7 +8,7 @@ import pytest
 from conftest import small_scene
 
 from mpmopt import __main__ as commands
-from mpmopt import runfile
+from mpmopt import binary, runfile
 from mpmopt.case import ProgressBar, summarise, table
 from mpmopt.multistart import random_start, report
 from mpmopt.optimize import Settings, Stage, optimise
@@ -157,3 +157,9 @@ def test_what_is_printed_of_several_small_starts_has_digits():
     lines = text.splitlines()
     assert len({len(line) for line in lines[:3]}) == 1
     are_told(text, 6 + 8 + 1)
+
+
+def test_a_gain_that_is_rounding_is_none():
+    assert binary.beyond_rounding(small_scene(), -4e-19) == 0.0
+    assert binary.beyond_rounding(small_scene(), 4e-9) == 4e-9
+    assert table({"gain": {"as designed": 0.0, "half the step": None}}).split("  ")[-1] == "-"

@@ -18,7 +18,13 @@ from walker import walker
 from mpmopt.errors import DesignError, MpmoptError
 from mpmopt.problem import Problem
 from mpmopt.scene import Actuator, Grid, Scene
-from mpmopt.verify import contact_free, dot_product_mismatch, report, taylor_test
+from mpmopt.verify import (
+    DOT_TOLERANCE,
+    contact_free,
+    dot_product_mismatch,
+    report,
+    taylor_test,
+)
 
 ROOT = Path(__file__).parent.parent
 
@@ -172,3 +178,10 @@ def test_single_precision_is_not_put_to_the_test():
     problem = Problem(small_scene(steps=2), precision="single")
     with pytest.raises(DesignError, match="precision"):
         report(problem, problem.join(0.0, 0.5, 0.0, 0.0))
+
+
+@pytest.mark.parametrize("spoilt", [np.nan, np.inf])
+def test_what_is_no_number_passes_no_check(spoilt, rng):
+    forward, back = (lambda v: {"y": 2.0 * v["x"]}), (lambda v, w: {"x": spoilt * w["y"]})
+    mismatch = dot_product_mismatch(forward, back, {"x": np.ones(3)}, rng)
+    assert not mismatch <= DOT_TOLERANCE
