@@ -18,7 +18,7 @@ LOOK = 64
 # the mean signal, its work is known to the square of that over twelve.
 SIGNAL_CHANGE = 0.2
 # Units in the last place that energies of few particles are off by, several times.
-ROUNDING = 32.0
+ROUNDING = 64.0
 
 
 @njit(**OPTIONS)
