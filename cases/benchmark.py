@@ -20,15 +20,16 @@ import tempfile
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from walker import walker
 
-from mpmopt.checkpoints import Checkpointing
-from mpmopt.objective import Objective
-from mpmopt.problem import Problem
-from mpmopt.simulate import Simulation
+from mpmopt.design.objective import Objective
+from mpmopt.design.problem import Problem
+from mpmopt.simulation.checkpoints import Checkpointing
+from mpmopt.simulation.simulation import Simulation
 
 PEERS = {"warp_mpm": "warp-lang", "taichi_mpm": "taichi", "jax_mpm": "jax"}
 VALUE_TOLERANCE, GRADIENT_TOLERANCE = 1e-10, 1e-9  # relative
@@ -48,7 +49,8 @@ def gradient_of(simulation: Simulation, objective: Objective, keep: Checkpointin
     """Ours: value and the derivatives that peers give."""
     with simulation.checkpoints(keep) as checkpoints:
         forward = simulation.forward(checkpoints)
-        return objective.value(forward.state), forward.reverse(objective.seed(forward.state))
+        bars = objective.terminal_adjoints(forward.states)
+        return objective.value(forward.states), forward.reverse(bars)
 
 
 def with_threads(number: int, run: Run) -> Run:
@@ -97,7 +99,7 @@ def threads_and_schedules(steps: int, rounds: int) -> str:
         runs[f"forward {number}"] = with_threads(number, simulation.run)
         for name, keep in (("recomputed", Checkpointing()), ("kept", KEEP_ALL)):
             runs[f"{name} {number}"] = with_threads(
-                number, lambda keep=keep: gradient_of(simulation, objective, keep)
+                number, partial(gradient_of, simulation, objective, keep)
             )
     seconds = in_turns(runs, rounds)
     per = 1e9 / (steps * simulation.initial.shape[1])
@@ -130,7 +132,7 @@ def sizes(quick: bool, rounds: int) -> str:
         seconds = in_turns(
             {
                 str(number): with_threads(
-                    number, lambda s=simulation, o=objective: gradient_of(s, o, Checkpointing())
+                    number, partial(gradient_of, simulation, objective, Checkpointing())
                 )
                 for number in (1, 2)
             },

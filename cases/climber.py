@@ -10,7 +10,9 @@ import sys
 
 import numpy as np
 
-from mpmopt.case import Case, main, sharpened
+from mpmopt.app.case import Case
+from mpmopt.app.script import main
+from mpmopt.optimisation.presets import continuation
 from mpmopt.scene import Actuator, Design, Grid, Mirror, Scene, Wall
 
 
@@ -49,8 +51,8 @@ def slanted_legs(positions: np.ndarray) -> np.ndarray:
 START = {"phi": 0.0, "a": 1.0, "theta": (0.7, 0.2, -0.3), "b": -0.5}
 
 CASES = {
-    "default": Case(climber(128, 5e-4), sharpened(5e-4), slanted_legs, START),
-    "preview": Case(climber(64, 8e-4), sharpened(8e-4), slanted_legs, START),
+    "default": Case(climber(128, 5e-4), continuation(5e-4), slanted_legs, START),
+    "preview": Case(climber(64, 8e-4), continuation(8e-4), slanted_legs, START),
 }
 
 if __name__ == "__main__":

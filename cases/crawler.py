@@ -10,7 +10,9 @@ import sys
 
 import numpy as np
 
-from mpmopt.case import Case, main, published, refined, sharpened
+from mpmopt.app.case import Case
+from mpmopt.app.script import main
+from mpmopt.optimisation.presets import coarse_to_fine, continuation, paper_preset
 from mpmopt.scene import Actuator, Design, Grid, Mirror, Scene, Wall
 
 
@@ -47,9 +49,9 @@ def slanted_legs(positions: np.ndarray) -> np.ndarray:
 
 
 CASES = {
-    "default": Case(crawler(128, 5e-4), refined(8e-4, 5e-4), slanted_legs),
-    "preview": Case(crawler(64, 8e-4), sharpened(8e-4), slanted_legs),
-    "paper": Case(crawler(128, 2e-4), published(2e-4), slanted_legs),
+    "default": Case(crawler(128, 5e-4), coarse_to_fine(8e-4, 5e-4), slanted_legs),
+    "preview": Case(crawler(64, 8e-4), continuation(8e-4), slanted_legs),
+    "paper": Case(crawler(128, 2e-4), paper_preset(2e-4), slanted_legs),
 }
 
 if __name__ == "__main__":

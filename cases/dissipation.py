@@ -20,13 +20,13 @@ import crawler
 import numpy as np
 import walker
 
-from mpmopt import runfile
-from mpmopt.binary import distance, kept
-from mpmopt.case import START
-from mpmopt.particles import Particles, lay_out
-from mpmopt.problem import Variables
+from mpmopt.app.case import START
+from mpmopt.assess.threshold import distance, kept
+from mpmopt.design.problem import Variables
+from mpmopt.results import runfile
 from mpmopt.scene import Grid, Material, Scene, Solid
-from mpmopt.simulate import Simulation
+from mpmopt.scene.particles import Particles, discretise
+from mpmopt.simulation.simulation import Simulation
 
 
 def cell_time(scene: Scene) -> float:
@@ -43,7 +43,7 @@ def travel(case, blend_time: float, halvings: int) -> float:
     """How far a drawn robot goes in one second, on 64 x 64 cells."""
     scene = replace(case.CASES["preview"].scene, blend_time=blend_time)
     scene = scene.vary(time_step=scene.time_step / 2**halvings)
-    particles = lay_out(scene)
+    particles = discretise(scene)
     keep = case.slanted_legs(particles.position[particles.designed])
     signal = Variables(np.zeros(0), *(np.array([START[name]]) for name in ("a", "theta", "b")))
     start = distance(replace(scene, steps=1), keep, signal)
@@ -52,8 +52,8 @@ def travel(case, blend_time: float, halvings: int) -> float:
 
 def designed(path: Path, blend_time: float, halvings: int) -> float:
     """How far the best design of a run goes without its void."""
-    run = runfile.read(path)
-    problem, x = run.problem(), run.best
+    run = runfile.read_run(path).run
+    problem, x = run.problem(), run.result.x
     scene = replace(problem.scene.vary(time_step=8e-4 / 2**halvings), blend_time=blend_time)
     keep, signal = kept(problem, x), problem.split(x)
     return distance(scene, keep, signal) - distance(replace(scene, steps=1), keep, signal)
@@ -79,11 +79,11 @@ def spinning_disc(blend_time: float, halvings: int) -> float:
         Grid((64, 64), 1 / 64), dt, round(1 / dt), (Solid((0.25, 0.25), (0.75, 0.75)),),
         blend_time=blend_time,
     )  # fmt: skip
-    everything = lay_out(scene)
+    everything = discretise(scene)
     disc = everything.subset(np.hypot(*(everything.position.T - 0.5)) < 0.15)
     x, y = disc.position.T - 0.5
-    spin = np.array([[0.0], [-10.0], [10.0], [0.0]])
-    simulation = moving(scene, disc, 10.0 * np.array([-y, x]), spin)
+    velocity_increment = np.array([[0.0], [-10.0], [10.0], [0.0]])
+    simulation = moving(scene, disc, 10.0 * np.array([-y, x]), velocity_increment)
     return kinetic(scene, simulation.run()) / kinetic(scene, simulation.initial)
 
 
@@ -107,7 +107,7 @@ def vibrating_bar(blend_time: float, halvings: int) -> float:
         material=Material(lame_lambda=0.0, lame_mu=E / 2, density=1.0),
     )  # fmt: skip
     scene = replace(scene, blend_time=blend_time * cell_time(scene) / CELL_TIME)
-    bar = lay_out(scene)
+    bar = discretise(scene)
     x = bar.position[:, 0] - 30.0
     velocity, slope = np.zeros((2, len(x))), np.zeros((4, len(x)))
     velocity[0], slope[0] = speed * np.sin(beta * x), speed * beta * np.cos(beta * x)
@@ -130,7 +130,7 @@ def two_discs(blend_time: float, halvings: int) -> float:
         material=material,
     )  # fmt: skip
     scene = replace(scene, blend_time=blend_time * cell_time(scene) / CELL_TIME)
-    everything = lay_out(scene)
+    everything = discretise(scene)
     low, high = (np.hypot(*(everything.position.T - 0.1 - c)) < 0.2 for c in (0.2, 0.8))
     discs = everything.subset(low | high)
     side = np.where(low[low | high], 0.1, -0.1)

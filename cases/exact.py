@@ -4,16 +4,17 @@ import math
 
 import numpy as np
 
-from mpmopt import mpm
-from mpmopt.checkpoints import Checkpointing
-from mpmopt.objective import Objective
-from mpmopt.particles import lay_out
+from mpmopt import kernels
+from mpmopt.design.objective import Objective
 from mpmopt.scene import Grid, Material, Mirror, Scene, Solid
-from mpmopt.simulate import Simulation, world_of
+from mpmopt.scene.particles import discretise
+from mpmopt.simulation.checkpoints import Checkpointing
+from mpmopt.simulation.simulation import Simulation
+from mpmopt.simulation.surroundings import world_of
 
 
 def solid_simulation(scene, particles=None, state=None, precision="double"):
-    particles = particles or lay_out(scene)
+    particles = particles or discretise(scene)
     ones = np.ones(len(particles.position))
     material = scene.material
     signal = np.zeros((scene.steps, len(scene.actuators)))
@@ -69,7 +70,7 @@ class Bar:
             particles_per_cell=per_cell, mirror=Mirror("x", held), direction=(0.0, 1.0),
             blend_time=blend_time,
         )  # fmt: skip
-        particles = lay_out(scene)
+        particles = discretise(scene)
         beta = math.pi / (2.0 * self.length)
         self.omega = beta * self.speed
         self.state = at_rest(particles)
@@ -79,7 +80,7 @@ class Bar:
         self.state[8] = 1.0 / (1.0 + scene.time_step * self.state[4])
         self.middle = -free - self.length / 2.0
         self.simulation = solid_simulation(scene, particles, self.state, precision)
-        self.objective = Objective.of(particles, (-1.0, 0.0))
+        self.objective = Objective.of(scene, particles, (-1.0, 0.0))
         self.checkpointing = checkpointing or Checkpointing()
 
     def exact(self):
@@ -94,8 +95,8 @@ class Bar:
         simulation, state = self.simulation, self.state
         with simulation.checkpoints(self.checkpointing) as store:
             forward = simulation.forward(store)
-            value = float(self.objective.value(forward.state))
-            bar = forward.reverse(self.objective.seed(forward.state))
+            value = float(self.objective.value(forward.states))
+            bar = forward.reverse(self.objective.terminal_adjoints(forward.states))
         by_mu = simulation.scene.material.lame_mu * bar.lame_mu.sum()
         strain = simulation.scene.time_step * state[4]
         by_v0 = bar.state[[2, 4, 8]] * [state[2], state[4], -strain / (1.0 + strain) ** 2]
@@ -121,7 +122,7 @@ def manufactured_error(n, amplitude, courant=0.2, per_cell=2):
         Grid((n + 6, n + 6), dx), time_step=dt, steps=steps, material=material,
         body=(Solid((offset, offset), (1 + offset, 1 + offset)),), particles_per_cell=per_cell,
     )  # fmt: skip
-    particles = lay_out(scene)
+    particles = discretise(scene)
     simulation = solid_simulation(scene, particles)
     body, world = simulation.body, world_of(scene)
     X = particles.position.T - offset
@@ -144,32 +145,32 @@ def manufactured_error(n, amplitude, courant=0.2, per_cell=2):
     old[8], old[11] = 1.0 / (1.0 + dt * old[4]), 1.0 / (1.0 + dt * old[7])
     shape, groups, side = old.shape, len(body.mass), n + 7
     every, window = (0, groups), (0, 0, side, side)
-    old = mpm.grouped(old)
+    old = kernels.grouped(old)
     new = old.copy()
-    nodes, velocity = np.zeros((1, side * side, mpm.NODE_SIZE)), np.zeros((1, 2 * side * side))
+    nodes, velocity = np.zeros((1, side * side, kernels.NODE_SIZE)), np.zeros((1, 2 * side * side))
     cells, velocity_cells = np.zeros((9 * side * side, 4)), np.zeros(18 * side * side)
-    tile, grid = mpm.make_tile(groups, old), nodes[0]
+    tile, grid = kernels.make_tile(groups, old), nodes[0]
     log_J = np.zeros((groups, 4))
     worst = 0.0
     for step in range(steps):
         push = dt * force(step * dt)
-        old[2::12] += mpm.grouped(push[:1])
-        old[3::12] += mpm.grouped(push[1:])
-        mpm.deform(old, new, world, log_J, *every)
-        mpm.locate(old, world, window, tile, *every)
-        mpm.stress(old, new, log_J, body, world, np.zeros(0), tile, *every)
+        old[2::12] += kernels.grouped(push[:1])
+        old[3::12] += kernels.grouped(push[1:])
+        kernels.deform(old, new, world, log_J, *every)
+        kernels.locate(old, world, window, tile, *every)
+        kernels.stress(old, new, log_J, body, world, np.zeros(0), tile, *every)
         cells[:] = 0.0
-        mpm.p2g(old, body, tile, cells, *every)
-        mpm.taylor_adjoint(cells, window, grid)
+        kernels.p2g(old, body, tile, cells, *every)
+        kernels.taylor_adjoint(cells, window, grid)
         mirror(grid.reshape(side, side, 4), 0, n)
         mirror(grid.reshape(side, side, 4).transpose(1, 0, 2), 1, n)
         for column in range(side):
-            mpm.grid_update(nodes, window, world, velocity, column)
-        mpm.taylor(velocity[0], window, window, velocity_cells)
-        mpm.g2p(old, new, world, tile, velocity_cells, *every)
+            kernels.grid_update(nodes, window, world, velocity, column)
+        kernels.taylor(velocity[0], window, window, velocity_cells)
+        kernels.g2p(old, new, world, tile, velocity_cells, *every)
         old, new = new, old
         u, _ = exact((step + 1) * dt)
-        error = mpm.ungrouped(old, *shape)[0:2] - offset - X - u
+        error = kernels.ungrouped(old, *shape)[0:2] - offset - X - u
         worst = max(worst, math.sqrt((error**2).sum(axis=0).mean()) / amplitude)
     return worst
 

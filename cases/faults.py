@@ -31,12 +31,16 @@ from typing import Any
 import h5py
 from walker import slanted_legs, walker
 
-from mpmopt import case, runfile, simulate
-from mpmopt.checkpoints import Checkpointing
-from mpmopt.files import replace_file
-from mpmopt.interrupt import how_to_go_on, reported
-from mpmopt.optimize import Settings, Stage
-from mpmopt.sweeps import as_csv
+import mpmopt
+from mpmopt.app import case
+from mpmopt.app.summary import table
+from mpmopt.app.sweeps import as_csv
+from mpmopt.io.console import how_to_go_on, reported
+from mpmopt.io.files import replace_file
+from mpmopt.optimisation.settings import Settings, Stage
+from mpmopt.results import runfile
+from mpmopt.simulation import buffers, simulation
+from mpmopt.simulation.checkpoints import Checkpointing
 
 SMALL = case.Case(
     dataclasses.replace(walker(64, 8e-4), steps=200),
@@ -44,7 +48,7 @@ SMALL = case.Case(
         (
             Stage(0.5, 1e-2, 1e-3, 1.6e-3, coarsening=2),
             Stage(2.0, 1e-2, 1e-3, 8e-4),
-            Stage(8.0, 1e-2, 1e-3, 8e-4, solid=True, leave_out=0.05),
+            Stage(8.0, 1e-2, 1e-3, 8e-4, solid=True, void_cutoff=0.05),
         ),
         scouting=1,
         window=2,
@@ -100,11 +104,12 @@ def child(out: Path, phase: Path | None, on_disk: bool) -> int:
 
             return told
 
-        simulate.together = telling(simulate.together, lambda *a: a[2].__name__)
+        tell = telling(simulation.in_parallel, lambda *a: a[1].__name__)
+        buffers.in_parallel = simulation.in_parallel = tell  # the way forward, and back
         runfile.replace_file = telling(runfile.replace_file, lambda *a: "write")
     checkpointing = Checkpointing(every=7, store="disk") if on_disk else None
     return reported(
-        lambda: print(case.table(case.run(SMALL, out, checkpointing))),
+        lambda: print(table(case.run(SMALL, out, checkpointing))),
         lambda: how_to_go_on(out / "run.h5"),
     )
 
@@ -166,7 +171,8 @@ def kills(folder: Path, whole: dict[str, Any], count: int, dice: random.Random) 
     while count > 0:
         out = folder / f"killed-{run}"
         run += 1
-        at, alive = [], True
+        at: list[str] = []
+        alive = True
         while alive and len(at) < 4 and count > 0:
             process = Process(out)
             begun = process.wait_for("forward")
@@ -185,7 +191,7 @@ def kills(folder: Path, whole: dict[str, Any], count: int, dice: random.Random) 
             done[0] += 1
             done[1] += same
         show(f"{run} runs, {count} kills left")
-    return [Row(f"SIGKILL in {phase}", *done) for phase, done in sorted(where.items())]
+    return [Row(f"SIGKILL in {phase}", done[0], done[1]) for phase, done in sorted(where.items())]
 
 
 def signals(folder: Path, whole: dict[str, Any], dice: random.Random, count: int) -> list[Row]:
@@ -317,7 +323,7 @@ def company(folder: Path, whole: dict[str, Any]) -> list[Row]:
 def read_only(folder: Path, whole: dict[str, Any]) -> list[Row]:
     """Nothing but the folder of results can be written: neither the package nor any cache."""
     place = folder / "installed"
-    package = Path(simulate.__file__).parent
+    package = Path(mpmopt.__file__).parent
     shutil.copytree(package, place / "mpmopt", ignore=shutil.ignore_patterns("__pycache__"))
     for path in (*place.rglob("*"), place):
         path.chmod(0o555 if path.is_dir() else 0o444)

@@ -30,14 +30,17 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from numba import config
 
-from mpmopt import mpm, runfile
-from mpmopt.binary import post_processed
+from mpmopt import kernels
+from mpmopt.assess.threshold import post_processed
+from mpmopt.design.problem import Problem
 from mpmopt.errors import MpmoptError
-from mpmopt.history import Optimisation
-from mpmopt.optimize import Settings, Stage, go_on, optimise
-from mpmopt.problem import Problem
+from mpmopt.io.checksums import sealed
+from mpmopt.kernels import simd
+from mpmopt.optimisation.history import Optimisation
+from mpmopt.optimisation.loop import go_on, optimise
+from mpmopt.optimisation.settings import Settings, Stage
+from mpmopt.results import runfile
 from mpmopt.scene import Actuator, Design, Grid, Material, Mirror, Scene, Solid, Wall
-from mpmopt.seals import sealed
 
 MEMORY = 4 * 10**9  # bytes of address space above what a process has when it starts
 SECONDS = 60  # of one input
@@ -68,7 +71,7 @@ ODD_NUMBERS = [
     0, -1, 1, 2, 3.7, -0.0, 1e-300, 5e-324, 1e-30, 1e-12, 1e12, 1e30, 1e300, -1e300, 1e9, 10**9,
     10**12, 2**63, 2**64, 10**400, 10**5000, math.nan, math.inf, -math.inf, 0.1 + 0.2, 1 / 3,
 ]  # fmt: skip
-ODD_VALUES = [
+ODD_VALUES: list[Any] = [
     *ODD_NUMBERS, None, True, False, "", "x", "stick", "below", "\ud800", "1", "1e5", [], {}, [1],
     [1, 2, 3], [[1, 2], [3, 4]], [[]], {"a": 1}, [None, None], ["x", "y"], [math.nan, 0.0],
     [1e308, 1e308], [10**9, 10**9], 1000 * [0.0], "x" * 10000,
@@ -112,14 +115,14 @@ def plausible(draw: Any) -> dict[str, Any]:
         "lame_lambda": mu * draw(st.sampled_from([0.0, 1.0, 10.0])),
         "lame_mu": mu,
         "density": draw(st.sampled_from([1.0, 1.0, 1e-6, 1e6])),
-        "stiffness_floor": draw(st.sampled_from([1e-3, 1e-2, 1e-6, 1.0])),
-        "mass_floor": draw(st.sampled_from([1e-2, 1e-2, 1e-3, 1.0])),
+        "void_stiffness": draw(st.sampled_from([1e-3, 1e-2, 1e-6, 1.0])),
+        "void_density": draw(st.sampled_from([1e-2, 1e-2, 1e-3, 1.0])),
     }
     walls = []
     if draw(st.booleans()) and not mirrored:
         friction = draw(st.sampled_from(["stick", 0.0, 0.3, 1e6]))
         walls.append({"axis": "y", "position": dx, "solid_side": "below", "friction": friction})
-    light = max(1.0, material["stiffness_floor"] / material["mass_floor"])
+    light = max(1.0, material["void_stiffness"] / material["void_density"])
     stiffness = 2.0 * light * (mu + material["lame_lambda"]) / material["density"]
     courant = draw(st.sampled_from([0.1, 0.5, 0.9, 1.0 - 1e-9]))
     time_step = courant * dx / math.sqrt(stiffness)
@@ -248,10 +251,11 @@ def run_scene(scene: Scene, kind: int) -> None:
     """Value and gradient of a scene, in one of several ways; the result must be finite."""
     if scene.steps > 20:
         return  # a valid one that takes long
-    options: dict[str, Any] = [
-        {}, {"redo": 0}, {"precision": "single"}, {"leave_out": 0.5, "beta": 8.0}
-    ][kind]  # fmt: skip
-    problem = Problem(scene, **options)
+    choices: tuple[dict[str, Any], ...] = (
+        {}, {"halvings": 0, "limits": None}, {"precision": "single"},
+        {"void_cutoff": 0.5, "beta": 8.0},
+    )  # fmt: skip
+    problem = Problem(scene, **choices[kind])
     x = problem.join(
         np.linspace(-1.0, 1.0, problem.size - 3 * len(scene.actuators)), 1.0, -0.3, -0.5
     )
@@ -280,7 +284,7 @@ SMALL = Scene(
         Actuator((3 / 16, 6 / 16), (5 / 16, 7 / 16)),
         Solid((5 / 16, 6 / 16), (7 / 16, 7 / 16)),
     ),
-    material=Material(mass_floor=1e-2),
+    material=Material(void_density=1e-2),
 )
 SIZE = 32 + 3
 ODD_DESIGNS = [
@@ -472,9 +476,9 @@ def damage(content: bytes, kind: str, how: Any, path: Path) -> None:
 
 def run_file(path: Path) -> None:
     """Read a run file, use what is in it, and go on with it."""
-    found = runfile.read(path)
-    _finite(found.problem().gamma(found.best), found.history["objective"])
-    go_on(found.run)
+    run = runfile.read_run(path).run
+    _finite(run.problem().gamma(run.result.x), [item.objective for item in run.history])
+    go_on(run)
 
 
 def small_run(path: Path) -> bytes:
@@ -587,7 +591,10 @@ def check_indices() -> None:
         return within
 
     for name in ("load", "store", "number", "set_number"):
-        setattr(mpm, name, checked(getattr(mpm, name)))
+        right: Callable[..., Any] = getattr(simd, name)
+        for module in [m for m in sys.modules.values() if m.__name__.startswith(kernels.__name__)]:
+            if getattr(module, name, None) is right:
+                setattr(module, name, checked(right))
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -598,7 +605,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--json", type=Path, help="leave the rows here too")
     arguments = parser.parse_args(argv)
     used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-    if config.DISABLE_JIT:
+    if getattr(config, "DISABLE_JIT", 0):
         check_indices()
     hard = resource.getrlimit(resource.RLIMIT_AS)[1]
     resource.setrlimit(resource.RLIMIT_AS, (used + MEMORY, hard))

@@ -18,8 +18,9 @@ from typing import Any
 import crawler
 import walker
 
-from mpmopt import case, runfile
+from mpmopt.app import case
 from mpmopt.errors import MpmoptError
+from mpmopt.results import runfile
 
 CASES = {"walker": walker.CASES, "crawler": crawler.CASES}
 SETTINGS = ("default", "preview", "paper")
@@ -73,11 +74,11 @@ def summary_of(name: str, setting: str, folder: Path) -> dict[str, Any]:
     path = folder / "run.h5"
     if not path.exists():
         return case.run(CASES[name][setting], folder)
-    found = runfile.read(path)
+    found = runfile.read_run(path)
     if not found.summary:
         raise MpmoptError(f"{path} holds a run that was not finished; move it away")
     wanted = CASES[name][setting]
-    if (found.scene, found.settings) != (wanted.scene, wanted.settings):
+    if (found.run.scene, found.run.settings) != (wanted.scene, wanted.settings):
         raise MpmoptError(f"{path} holds another scene or other settings; choose another folder")
     return found.summary
 

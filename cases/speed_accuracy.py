@@ -25,7 +25,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import crawler
 import h5py
@@ -33,20 +33,22 @@ import numpy as np
 import walker
 from benchmark import processor
 from exact import Bar, manufactured_error
+from matplotlib.artist import Artist
+from matplotlib.patches import Rectangle
 
-from mpmopt.actuation import signal_adjoint
-from mpmopt.checkpoints import Checkpointing
-from mpmopt.discretisation import Discretisation, Measured, density, measure, timed
+from mpmopt.app.sweeps import connected, results, sweep
+from mpmopt.assess.discretisation import Discretisation, Measured, density, measure, timed
+from mpmopt.design.actuation import signal_adjoint
+from mpmopt.design.problem import Problem
 from mpmopt.errors import MpmoptError
-from mpmopt.problem import Problem
 from mpmopt.scene import Scene
-from mpmopt.sweeps import connected, results, sweep
+from mpmopt.simulation.checkpoints import Checkpointing
 
 BETA = 8.0
 PATCH = 1 / 32  # gradients are compared as sums over squares of this width
 # Heavier void than the cases have: where it is light, a few flung particles have a gradient that
 # grows without limit as cells shrink, and that would be all that the chart shows.
-FLOORS = {"mass_floor": 1e-1, "stiffness_floor": 1e-2}
+FLOORS: dict[str, Any] = {"void_density": 1e-1, "void_stiffness": 1e-2}
 C = 1 / 64  # the unit of length of both robots
 
 
@@ -103,7 +105,7 @@ class Choice:
     name: str
     marker: str
     per_cell: int = 2
-    precision: str = "double"
+    precision: Literal["double", "single"] = "double"
     memory: int = 256_000_000
     blend_time: float = 0.0
 
@@ -335,7 +337,7 @@ def print_peer(name: str, robot: str) -> None:
     module, _, _ = PEERS[name]
     peer = importlib.import_module(f"peers.{module}")
     if "single" in name:
-        peer.real = peer.ti.f32
+        vars(peer)["real"] = vars(peer)["ti"].f32
     scene, phi = ROBOTS[robot]
     plane, scene = scene.mirror, replace(scene, mirror=None)
     problem = Problem(scene, BETA)
@@ -348,7 +350,7 @@ def print_peer(name: str, robot: str) -> None:
     variables = problem.split(x)
     material = (np.asarray(bars[key], float) for key in ("density", "lame_lambda", "lame_mu"))
     signal = signal_adjoint(scene, variables.a, variables.theta, np.asarray(bars["signal"], float))
-    gradient = np.concatenate([problem.chain.pullback(variables.phi, *material), *signal])
+    gradient = np.concatenate([problem.chain.field(variables.phi).pullback(*material), *signal])
     status = Path("/proc/self/status").read_text().splitlines()
     print(
         json.dumps(
@@ -356,7 +358,7 @@ def print_peer(name: str, robot: str) -> None:
                 "seconds": seconds,
                 "megabytes": next(int(s.split()[1]) for s in status if s.startswith("VmHWM"))
                 / 1024,
-                "travel": value - float(objective.value(simulation.initial)),
+                "travel": value - objective.start,
                 "gradient": density(problem, gradient, PATCH, plane).tolist(),
             }
         )
@@ -502,7 +504,7 @@ def draw(path: Path, points: Sequence[Point], known: dict[str, tuple[float, floa
             ax.set_ylabel(what)
         _steps(axes[2, column], mine)
     choices = [name for name in markers if any(p.choice == name for p in points)]
-    handles = [
+    handles: list[Artist] = [
         Line2D([], [], marker="o", ls="", color=COLOURS[n], label=f"n = {n}")
         for n in sorted({p.n for p in points})
     ]
@@ -512,7 +514,7 @@ def draw(path: Path, points: Sequence[Point], known: dict[str, tuple[float, floa
     ]
     handles += [
         Line2D([], [], color="black", lw=1.2, drawstyle="steps-post", label="Pareto front"),
-        plt.Rectangle((0, 0), 1, 1, color="#e8e8e8", label="less than the reference knows"),
+        Rectangle((0, 0), 1, 1, color="#e8e8e8", label="less than the reference knows"),
     ]
     figure.legend(handles=handles, loc="lower center", ncols=6, frameon=False)
     figure.subplots_adjust(0.06, 0.1, 0.985, 0.97, wspace=0.24, hspace=0.22)

@@ -11,7 +11,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from mpmopt.case import Case, main, published, refined, sharpened
+from mpmopt.app.case import Case
+from mpmopt.app.script import main
+from mpmopt.optimisation.presets import coarse_to_fine, continuation, paper_preset
 from mpmopt.scene import Actuator, Design, Grid, Scene, Solid, Wall
 
 
@@ -44,15 +46,17 @@ def slanted_legs(positions: np.ndarray) -> np.ndarray:
 
 CASES = {
     # Its joints stretch more than twice, which two particles per cell do not bear.
-    "default": Case(walker(128, 5e-4, particles_per_cell=3), refined(8e-4, 5e-4), slanted_legs),
-    "preview": Case(walker(64, 8e-4), sharpened(8e-4), slanted_legs),
-    "paper": Case(walker(128, 2e-4), published(2e-4), slanted_legs),
+    "default": Case(
+        walker(128, 5e-4, particles_per_cell=3), coarse_to_fine(8e-4, 5e-4), slanted_legs
+    ),
+    "preview": Case(walker(64, 8e-4), continuation(8e-4), slanted_legs),
+    "paper": Case(walker(128, 2e-4), paper_preset(2e-4), slanted_legs),
     # The others lunge, once. Of this one three seconds count, after a first that does not.
     "steady": Case(
         replace(
             walker(64, 8e-4), walls=(Wall("y", 4 / 64, friction=0.5),), steps=5000, transient=1.0
         ),
-        sharpened(8e-4),
+        continuation(8e-4),
         slanted_legs,
     ),
 }

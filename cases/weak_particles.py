@@ -21,19 +21,20 @@ import numpy as np
 import walker
 from numpy.typing import NDArray
 
-from mpmopt import runfile
-from mpmopt.actuation import signal
-from mpmopt.audit import laid_out, refined
-from mpmopt.binary import Drawing, distance, full_block, post_processed
-from mpmopt.case import START
-from mpmopt.design import interpolate
+from mpmopt.app.case import START
+from mpmopt.assess.refinement import mapped, refined
+from mpmopt.assess.threshold import Baseline, distance, post_processed
+from mpmopt.design.actuation import signal
+from mpmopt.design.chain import interpolate
+from mpmopt.design.objective import Objective
+from mpmopt.design.problem import Problem, Variables
 from mpmopt.errors import MpmoptError, SimulationError
-from mpmopt.objective import Objective
-from mpmopt.optimize import Optimisation, Settings, Stage, optimise
-from mpmopt.particles import lay_out
-from mpmopt.problem import Problem, Variables
+from mpmopt.optimisation.loop import Optimisation, optimise
+from mpmopt.optimisation.settings import Settings, Stage
+from mpmopt.results import runfile
 from mpmopt.scene import Scene
-from mpmopt.simulate import Simulation
+from mpmopt.scene.particles import discretise
+from mpmopt.simulation.simulation import Simulation
 
 CASES = {
     "walker": (walker.walker, walker.slanted_legs),
@@ -47,13 +48,13 @@ STEP_IN_CELLS = 0.1024  # seconds per unit of dx: Courant number 0.56
 class Void(NamedTuple):
     """How much of void is simulated, and from which beta on it is left out."""
 
-    mass_floor: float
+    void_density: float
     left_out_from: float = np.inf
-    stiffness_floor: float = 1e-3
+    void_stiffness: float = 1e-3
 
     def of(self, scene: Scene) -> Scene:
         """The scene with these floors."""
-        return scene.vary(mass_floor=self.mass_floor, stiffness_floor=self.stiffness_floor)
+        return scene.vary(void_density=self.void_density, void_stiffness=self.void_stiffness)
 
 
 VOIDS = {
@@ -87,12 +88,13 @@ def short_optimisation(scene: Scene, void: Void, iterations: int) -> Optimisatio
     stages = tuple(
         Stage(
             beta,
-            void.mass_floor,
-            void.stiffness_floor,
+            void.void_density,
+            void.void_stiffness,
             scene.time_step,
             solid=beta >= 16.0,
-            leave_out=LEAVE_OUT if beta >= void.left_out_from else 0.0,
-            redo=0,  # what fails shall count
+            void_cutoff=LEAVE_OUT if beta >= void.left_out_from else 0.0,
+            halvings=0,  # what fails shall count
+            limited=False,
         )
         for beta in BETAS
     )
@@ -115,20 +117,20 @@ def distance_with_void(
     if np.isfinite(void.left_out_from):
         return distance(scene, keep, variables)
     scene = void.of(scene)
-    particles = lay_out(scene)
+    particles = discretise(scene)
     gamma = np.ones(particles.designed.size)
     gamma[particles.designed] = keep
     material = interpolate(scene.material, gamma)
     driven = signal(scene, variables.a, variables.theta, variables.b)
     simulation = Simulation(scene, particles, *material, driven)
-    return float(Objective.of(particles, scene.direction).value(simulation.run()))
+    return float(Objective.of(scene, particles).centroid(simulation.run()))
 
 
 def moved(scene: Scene, keep: NDArray[np.bool_], variables: Variables) -> list[str]:
     """By how much of its gain over the full block each void moves a binary design, or why not."""
     try:
         removed = distance(scene, keep, variables)
-        gain = removed - distance(scene, full_block(keep), variables)
+        gain = removed - distance(scene, np.ones_like(keep), variables)
     except SimulationError:
         return ["fails without void"] * len(VOIDS)
     if gain <= 0.0:
@@ -188,13 +190,13 @@ def solid_distance(run: Optimisation) -> str:
 
 
 def designs(
-    scene: Scene, drawing: Drawing, run: Optimisation
+    scene: Scene, drawing: Baseline, run: Optimisation
 ) -> list[tuple[NDArray[np.bool_], Variables]]:
     """The drawn binary design and the optimised one, with their actuation, on a scene's grid."""
-    particles = lay_out(scene)
+    particles = discretise(scene)
     drawn = drawing(particles.position[particles.designed])
     problem, x = run.problem(), run.result.x
-    return [(drawn, start_actuation()), (laid_out(scene, problem, x), problem.split(x))]
+    return [(drawn, start_actuation()), (mapped(scene, problem, x), problem.split(x))]
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -21,15 +21,17 @@ import robot
 import walker
 
 import mpmopt
-from mpmopt import runfile
-from mpmopt.case import Case, drawn, summarise
-from mpmopt.files import make_folder, replace_file
-from mpmopt.film import film
-from mpmopt.motion import post_processed
-from mpmopt.optimize import Settings, Stage, optimise
-from mpmopt.plot import plot_motion
-from mpmopt.problem import Problem
-from mpmopt.progress import Progress
+from mpmopt.app.case import Case, drawn
+from mpmopt.app.summary import summarise
+from mpmopt.assess.trajectory import post_processed
+from mpmopt.design.problem import Problem
+from mpmopt.io.files import make_folder, replace_file
+from mpmopt.io.progress import Progress
+from mpmopt.optimisation.loop import optimise
+from mpmopt.optimisation.settings import Settings, Stage
+from mpmopt.results import runfile
+from mpmopt.view.film import film
+from mpmopt.view.plot import plot_motion
 
 OUT = Path(__file__).parent / "_gallery"
 CASES = {
@@ -47,7 +49,7 @@ ROWS = {
     "post_processed": "Post-processed",
     "actuation_off": "The same with its actuation off",
     "gain_kept": "Gain kept with half the step; twice the step; finer cells",
-    "loose_particles": "Loose particles",
+    "disconnected_particles": "Loose particles",
     "evaluations": "Evaluations",
     "failed_evaluations": "Failed evaluations",
 }
@@ -56,7 +58,7 @@ ROWS = {
 def small(time_step: float) -> Settings:
     """Three stages of twelve evaluations."""
     stages = tuple(
-        Stage(beta, mass_floor=1e-2, stiffness_floor=1e-3, time_step=time_step, solid=beta > 4.0)
+        Stage(beta, void_density=1e-2, void_stiffness=1e-3, time_step=time_step, solid=beta > 4.0)
         for beta in (1.0, 4.0, 16.0)
     )
     return Settings(stages, least_iterations=1, most_iterations=12, tolerance=0.0)
@@ -71,7 +73,7 @@ def make(name: str, case: Case) -> None:
     summary = summarise(result, drawn(Case(case.scene, settings, case.drawing)))
     path = OUT / f"{name}.h5"
     runfile.write(path, result, summary)
-    film(OUT / f"{name}.gif", runfile.read(path), SECONDS)
+    film(OUT / f"{name}.gif", result, SECONDS)
     plot_motion(OUT / f"{name}.png", post_processed(result.problem(), result.result.x), 4)
     table = io.StringIO()
     csv.writer(table).writerows((label, text(summary[key])) for key, label in ROWS.items())

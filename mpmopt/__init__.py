@@ -1,20 +1,54 @@
 """Topology optimisation of soft bodies that move, with a differentiable material point method."""
 
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
 
+# Public names, and the modules they are imported from when they are first used: ``import mpmopt``
+# costs nothing.
+_HOMES = {
+    "Scene": "mpmopt.scene",
+    "Grid": "mpmopt.scene",
+    "Material": "mpmopt.scene",
+    "Design": "mpmopt.scene",
+    "Solid": "mpmopt.scene",
+    "Actuator": "mpmopt.scene",
+    "Wall": "mpmopt.scene",
+    "Mirror": "mpmopt.scene",
+    "Problem": "mpmopt.design.problem",
+    "Settings": "mpmopt.optimisation.settings",
+    "Stage": "mpmopt.optimisation.settings",
+    "optimise": "mpmopt.optimisation.loop",
+    "minimize": "mpmopt.optimisation.minimize",
+    "read_run": "mpmopt.results.runfile",
+    "cheapest": "mpmopt.assess.discretisation",
+    "sweep": "mpmopt.app.sweeps",
+}
 
-def __getattr__(name: str) -> Any:
-    """Import a module when it is first used, so that ``import mpmopt`` costs nothing."""
-    if name == "cheapest":
-        return import_module("mpmopt.discretisation").cheapest
-    if name == "sweep":
-        return import_module("mpmopt.sweeps").sweep
-    try:
-        return import_module(f"mpmopt.{name}")
-    except ModuleNotFoundError as error:
-        if error.name != f"mpmopt.{name}":  # one that the module needs
-            raise
-        raise AttributeError(f"module 'mpmopt' has no attribute {name!r}") from None
+if TYPE_CHECKING:
+    from mpmopt.app.sweeps import sweep as sweep
+    from mpmopt.assess.discretisation import cheapest as cheapest
+    from mpmopt.design.problem import Problem as Problem
+    from mpmopt.optimisation.loop import optimise as optimise
+    from mpmopt.optimisation.minimize import minimize as minimize
+    from mpmopt.optimisation.settings import Settings as Settings
+    from mpmopt.optimisation.settings import Stage as Stage
+    from mpmopt.results.runfile import read_run as read_run
+    from mpmopt.scene import Actuator as Actuator
+    from mpmopt.scene import Design as Design
+    from mpmopt.scene import Grid as Grid
+    from mpmopt.scene import Material as Material
+    from mpmopt.scene import Mirror as Mirror
+    from mpmopt.scene import Scene as Scene
+    from mpmopt.scene import Solid as Solid
+    from mpmopt.scene import Wall as Wall
+else:
+
+    def __getattr__(name: str) -> Any:
+        if name in _HOMES:
+            return getattr(import_module(_HOMES[name]), name)
+        raise AttributeError(f"module 'mpmopt' has no attribute {name!r}")
+
+    def __dir__() -> list[str]:
+        return sorted([*globals(), *_HOMES])

@@ -20,26 +20,32 @@ import argparse
 import logging
 import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mpmopt import __version__
 from mpmopt.errors import DesignError
-from mpmopt.interrupt import how_to_go_on, reported
+from mpmopt.io.console import how_to_go_on, reported
 
-REPLACE = "replace files of that name even if mpmopt did not make them"
+if TYPE_CHECKING:
+    from mpmopt.results.runfile import RunFile
+
+
+def _read(path: Path) -> RunFile:
+    from mpmopt.results import runfile
+
+    return runfile.read_run(path)
 
 
 def plot(path: Path, out: Path | None, force: bool) -> int:
     """Write pictures of a run: its scene, its bodies in motion, its history."""
-    from mpmopt import runfile
-    from mpmopt.files import make_folder, refuse_foreign
-    from mpmopt.plot import picture_files, plot_run
-    from mpmopt.progress import Progress
+    from mpmopt.io.files import make_folder, refuse_existing
+    from mpmopt.io.progress import Progress
+    from mpmopt.view.plot import picture_files, plot_run
 
-    run = runfile.read(path)
+    run = _read(path).run
     folder = out or path.parent
     files = picture_files(folder).values()
-    refuse_foreign(files, force)
+    refuse_existing(files if out else (), force)
     make_folder(folder)
     with Progress("pictures", len(files)) as progress:
 
@@ -53,15 +59,14 @@ def plot(path: Path, out: Path | None, force: bool) -> int:
 
 def film(path: Path, out: Path | None, mp4: bool, seconds: float | None, force: bool) -> int:
     """Write a film of a run's design, the same without grey, and the full block."""
-    from mpmopt import runfile
-    from mpmopt.files import make_folder, refuse_foreign
-    from mpmopt.film import film as filmed
+    from mpmopt.io.files import make_folder, refuse_existing
+    from mpmopt.view.film import film as filmed
 
     if mp4 and out is not None and out.suffix.lower() != ".mp4":
         raise DesignError(f"--mp4 does not write {out}: leave --mp4 out, or let FILE end in .mp4")
-    run = runfile.read(path)
+    run = _read(path).run
     target = out or path.parent / ("film.mp4" if mp4 else "film.gif")
-    refuse_foreign([target], force)
+    refuse_existing([target] if out else (), force)
     make_folder(target.parent)
     print(f"{target}: {filmed(target, run, seconds)}")
     return 0
@@ -69,11 +74,10 @@ def film(path: Path, out: Path | None, mp4: bool, seconds: float | None, force: 
 
 def verify(path: Path) -> int:
     """Print the checks of a run's gradients; 1 if any failed."""
-    from mpmopt import runfile
-    from mpmopt.progress import Progress
-    from mpmopt.verify import Check, report
+    from mpmopt.assess.verify import Check, report
+    from mpmopt.io.progress import Progress
 
-    run = runfile.read(path)
+    run = _read(path).run
     with Progress("checks") as progress:
 
         def show(check: Check) -> None:
@@ -81,7 +85,7 @@ def verify(path: Path) -> int:
             progress.step(check.name)
             progress.print(f"{check.name:<34}  {check.value:12.3g}  {check.wanted:<10}  {mark}")
 
-        checks = report(run.problem(), run.best, progress=show)
+        checks = report(run.problem(), run.result.x, progress=show)
     failed = sum(not check.passed for check in checks)
     print(f"{len(checks) - failed} of {len(checks)} checks passed")
     return 1 if failed else 0
@@ -91,18 +95,24 @@ def postprocess(path: Path, threshold: float) -> int:
     """Print what a run's best design does once it is solid or absent everywhere."""
     import numpy as np
 
-    from mpmopt import runfile
-    from mpmopt.binary import farthest, full_block, kept, pieces, post_processed, share_kept
-    from mpmopt.checks import digits
+    from mpmopt.assess.threshold import (
+        farthest,
+        kept,
+        pieces,
+        post_processed,
+        share_kept,
+        solid_reference,
+    )
+    from mpmopt.validation import digits
 
-    run = runfile.read(path)
-    problem, x = run.problem(), run.best
+    found = _read(path)
+    problem, x = found.run.problem(), found.run.result.x
     keep = kept(problem, x, threshold)
     optimised = problem.value(x)
     value = post_processed(problem, x, threshold)
-    reference = run.summary.get("reference")
+    reference = found.summary.get("reference")
     if reference is None:
-        reference = farthest(problem.scene, full_block, problem.split(x))
+        reference = farthest(problem.scene, solid_reference, problem.split(x))
     share = share_kept(problem.scene, value - reference, optimised - reference)
     shown = "no gain to keep" if np.isnan(share) else f"{share:.1%}"
     sizes = np.bincount(pieces(problem.scene, keep)[keep])
@@ -121,13 +131,12 @@ def audit(path: Path) -> int:
     """Print whether a run's best design, without void, keeps its gain in other discretisations."""
     import numpy as np
 
-    from mpmopt import runfile
-    from mpmopt.audit import VARIANTS, Audited
-    from mpmopt.audit import audit as audited
-    from mpmopt.checks import digits
-    from mpmopt.progress import Progress
+    from mpmopt.assess.refinement import VARIANTS, Audited
+    from mpmopt.assess.refinement import audit as audited
+    from mpmopt.io.progress import Progress
+    from mpmopt.validation import digits
 
-    run = runfile.read(path)
+    run = _read(path).run
     with Progress("simulations", VARIANTS) as progress:
 
         def show(row: Audited) -> None:
@@ -146,16 +155,16 @@ def audit(path: Path) -> int:
             f"{'post-processed design':<21}  {'cells':>9}  {'step':>8}  full block     design  "
             "gain kept"
         )
-        audited(run.problem(), run.best, progress=show)
+        audited(run.problem(), run.result.x, progress=show)
     return 0
 
 
-def cheapest(path: Path, tolerance: float, gradient_tolerance: float | None, seconds: float) -> int:
+def cheapest(path: Path, tol: float, gradient_tol: float | None, seconds: float) -> int:
     """Print the cheapest discretisation that tells a run's best design as well as the finest."""
-    from mpmopt import discretisation, runfile
-    from mpmopt.progress import Progress
+    from mpmopt.assess import discretisation
+    from mpmopt.io.progress import Progress
 
-    run = runfile.read(path)
+    run = _read(path).run
     problem = run.problem()
     with Progress("discretisations") as progress:
 
@@ -165,11 +174,11 @@ def cheapest(path: Path, tolerance: float, gradient_tolerance: float | None, sec
 
         found = discretisation.cheapest(
             problem.scene,
-            run.best,
-            tolerance,
+            run.result.x,
+            tol,
             beta=problem.chain.beta,
-            leave_out=problem.leave_out,
-            gradient_tolerance=gradient_tolerance,
+            void_cutoff=problem.void_cutoff,
+            gradient_tolerance=gradient_tol,
             seconds=seconds,
             progress=show,
         )
@@ -177,7 +186,7 @@ def cheapest(path: Path, tolerance: float, gradient_tolerance: float | None, sec
     own = (found.objective_uncertainty, found.gradient_uncertainty)
     travel, gradient = ("unknown" if value != value else f"{value:.1%}" for value in own)
     print(f"its own uncertainty      travel {travel}, gradient {gradient}")
-    label = "cheapest near it" if found.doubt else f"cheapest within {tolerance:.3g}"
+    label = "cheapest near it" if found.doubt else f"cheapest within {tol:.3g}"
     print(f"{label:<24} {found.best}")
     if found.doubt:
         print(found.doubt)
@@ -186,23 +195,23 @@ def cheapest(path: Path, tolerance: float, gradient_tolerance: float | None, sec
 
 def resume(path: Path) -> int:
     """Go on with a run that was stopped, and print its summary."""
-    from mpmopt import case
+    from mpmopt.app.case import resume as resumed
+    from mpmopt.app.summary import table
 
-    print(case.table(case.resume(path)))
+    print(table(resumed(path)))
     return 0
 
 
 def export(path: Path, out: Path | None, force: bool, **options: Any) -> int:
     """Write a run's best design as files that other programs read; 1 if one cannot be written."""
-    from mpmopt import runfile
-    from mpmopt.export import FILES, size
-    from mpmopt.export import export as exported
-    from mpmopt.files import refuse_foreign
+    from mpmopt.io.files import refuse_existing
+    from mpmopt.results.export import FILES, size
+    from mpmopt.results.export import export as exported
 
-    run = runfile.read(path)
+    run = _read(path).run
     folder = out or path.parent
-    refuse_foreign((folder / FILES[name] for name in options["formats"]), force)
-    done = exported(run.problem(), run.best, folder, **options)
+    refuse_existing((folder / FILES[name] for name in options["formats"] if out), force)
+    done = exported(run.problem(), run.result.x, folder, **options)
     for file in done.paths:
         print(f"{file}  {file.stat().st_size} bytes")
     if done.polygons:
@@ -212,16 +221,21 @@ def export(path: Path, out: Path | None, force: bool, **options: Any) -> int:
         print(f"size    {width:.6g} x {height:.6g} mm, area {area:.6g} mm2")
         print(f"pieces  {len(done.polygons)}, with {holes} holes")
     if done.loose:
-        left = "left out" if options["drop_loose"] else "still there: --drop-loose leaves them out"
+        left = (
+            "left out"
+            if options["drop_components"]
+            else "still there: --drop-components leaves them out"
+        )
         print(f"{done.loose} particles hang on nothing, {left}")
     return 1 if done.failed else 0
 
 
 def main(argv: list[str] | None = None) -> int:
     """Run a command; the exit code is one of those in the module's text."""
-    arguments = _parser().parse_args(argv)
+    options = vars(_parser().parse_args(argv))
+    do, advice = options.pop("do"), options.pop("advice")
     logging.basicConfig(format="%(message)s")
-    return reported(lambda: arguments.do(arguments), lambda: arguments.advice(arguments.path))
+    return reported(lambda: do(**options), lambda: advice(options["path"]))
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -243,13 +257,19 @@ def _parser() -> argparse.ArgumentParser:
         command.add_argument("path", type=Path, metavar="RUN.h5", help="run file of a case")
         return command
 
+    def add_place(command: argparse.ArgumentParser, metavar: str, text: str) -> None:
+        command.add_argument("--out", type=Path, metavar=metavar, help=text)
+        command.add_argument(
+            "--force", action="store_true", help="replace files that are at --out already"
+        )
+
     command = add(
         "resume",
         "go on with it after a stop",
         "Go on with an unfinished run to the end that it would have had without a stop.",
         "out/walker/run.h5",
     )
-    command.set_defaults(do=lambda arguments: resume(arguments.path), advice=how_to_go_on)
+    command.set_defaults(do=resume, advice=how_to_go_on)
 
     command = add(
         "plot",
@@ -259,9 +279,8 @@ def _parser() -> argparse.ArgumentParser:
         "out/walker/run.h5",
         "out/walker/run.h5 --out pictures",
     )
-    command.add_argument("--out", type=Path, metavar="DIR", help="folder (default: the run's)")
-    command.add_argument("--force", action="store_true", help=REPLACE)
-    command.set_defaults(do=lambda arguments: plot(arguments.path, arguments.out, arguments.force))
+    add_place(command, "DIR", "folder (default: the run's)")
+    command.set_defaults(do=plot)
 
     command = add(
         "film",
@@ -273,18 +292,11 @@ def _parser() -> argparse.ArgumentParser:
         "out/walker/run.h5 --seconds 12 --out walker.gif",
     )
     command.add_argument("--mp4", action="store_true", help="film.mp4 instead of film.gif")
-    command.add_argument(
-        "--out", type=Path, metavar="FILE", help="ends in .gif or .mp4 (default: film.gif there)"
-    )
+    add_place(command, "FILE", "ends in .gif or .mp4 (default: film.gif there)")
     command.add_argument(
         "--seconds", type=float, help="that it plays (default: so that each period is seen)"
     )
-    command.add_argument("--force", action="store_true", help=REPLACE)
-    command.set_defaults(
-        do=lambda arguments: film(
-            arguments.path, arguments.out, arguments.mp4, arguments.seconds, arguments.force
-        )
-    )
+    command.set_defaults(do=film)
 
     command = add(
         "verify",
@@ -293,7 +305,7 @@ def _parser() -> argparse.ArgumentParser:
         "the order of Taylor's remainder. Exits with 1 if any check fails.",
         "out/walker/run.h5",
     )
-    command.set_defaults(do=lambda arguments: verify(arguments.path))
+    command.set_defaults(do=verify)
 
     command = add(
         "postprocess",
@@ -305,7 +317,7 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument(
         "--threshold", type=float, default=0.3, help="gamma from which a particle stays (0.3)"
     )
-    command.set_defaults(do=lambda arguments: postprocess(arguments.path, arguments.threshold))
+    command.set_defaults(do=postprocess)
 
     command = add(
         "audit",
@@ -314,7 +326,7 @@ def _parser() -> argparse.ArgumentParser:
         "the step, and cells half as wide. Numerical propulsion keeps little.",
         "out/walker/run.h5",
     )
-    command.set_defaults(do=lambda arguments: audit(arguments.path))
+    command.set_defaults(do=audit)
 
     command = add(
         "cheapest",
@@ -327,17 +339,11 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument(
         "--tol", type=float, default=0.05, help="relative tolerance of travel and gradient (0.05)"
     )
-    command.add_argument(
-        "--gradient-tol", type=float, default=None, help="another one of the gradient; inf: any"
-    )
+    command.add_argument("--gradient-tol", type=float, help="another one of the gradient; inf: any")
     command.add_argument(
         "--seconds", type=float, default=60.0, help="what the finest reference may take (60)"
     )
-    command.set_defaults(
-        do=lambda arguments: cheapest(
-            arguments.path, arguments.tol, arguments.gradient_tol, arguments.seconds
-        )
-    )
+    command.set_defaults(do=cheapest)
 
     command = add(
         "export",
@@ -346,7 +352,7 @@ def _parser() -> argparse.ArgumentParser:
         "millimetres, motion.vtkhdf in the scene's units. DXF and STL need pip install\n"
         "'mpmopt[export]'.",
         "out/walker/run.h5 --svg --dxf --stl --vtk --width 60",
-        "out/walker/run.h5 --stl --scale 200 --thickness 8 --drop-loose --out parts",
+        "out/walker/run.h5 --stl --scale 200 --thickness 8 --drop-components --out parts",
     )
     for name, text in (
         ("svg", "write a drawing"),
@@ -368,17 +374,10 @@ def _parser() -> argparse.ArgumentParser:
         "--threshold", type=float, default=0.3, help="gamma from which a particle stays (0.3)"
     )
     command.add_argument(
-        "--drop-loose", action="store_true", help="leave out pieces that hang on nothing"
+        "--drop-components", action="store_true", help="leave out pieces that hang on nothing"
     )
-    command.add_argument("--out", type=Path, metavar="DIR", help="folder (default: the run's)")
-    command.add_argument(
-        "--force", action="store_true", help="replace files of those names, whoever made them"
-    )
-    command.set_defaults(
-        do=lambda arguments: export(
-            **{k: v for k, v in vars(arguments).items() if k not in ("do", "advice")}
-        )
-    )
+    add_place(command, "DIR", "folder (default: the run's)")
+    command.set_defaults(do=export)
     return parser
 
 

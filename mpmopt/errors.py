@@ -41,7 +41,7 @@ class SimulationError(MpmoptError, ArithmeticError):
         return f"step {self.step}, {where}: {self.what}; {self.hint}"
 
 
-class TornError(SimulationError):
+class FractureError(SimulationError):
     """Solid stretched so far that nothing holds its particles together; no step mends that."""
 
 

@@ -5,9 +5,10 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from mpmopt import runfile
-from mpmopt.optimize import Settings, Stage, begin, optimise
-from mpmopt.problem import Problem
+from mpmopt.design.problem import Problem
+from mpmopt.optimisation.loop import begin, optimise
+from mpmopt.optimisation.settings import Settings, Stage
+from mpmopt.results import runfile
 from mpmopt.scene import Actuator, Design, Grid, Material, Scene, Solid, Wall
 
 
@@ -29,7 +30,7 @@ def small_scene(**changes) -> Scene:
         "grid": Grid(cells=(16, 16), dx=c),
         "time_step": 4e-3,
         "steps": 40,
-        "material": Material(mass_floor=1e-2, stiffness_floor=1e-3),
+        "material": Material(void_density=1e-2, void_stiffness=1e-3),
         "gravity": (0.5, -10.0),
         "walls": (Wall("y", 4 * c, friction=0.3), Wall("x", 3 * c)),
         "body": (
@@ -68,7 +69,7 @@ def short_path(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def short_run(short_path):
-    return runfile.read(short_path)
+    return runfile.read_run(short_path).run
 
 
 def empty(scene: Scene):

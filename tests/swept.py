@@ -25,8 +25,11 @@ def square(x, log=os.devnull):
 def held_square(x, log, go):
     """From the fourth point on, waits until there is a file."""
     note(log, os.getpid())
-    while x >= 3 and not Path(go).exists():
-        time.sleep(0.02)
+    try:
+        while x >= 3 and not Path(go).exists():
+            time.sleep(0.02)
+    except KeyboardInterrupt:
+        note(log, "interrupted")
     return {"square": x * x}
 
 
@@ -37,25 +40,24 @@ def picky(x, log, refused):
     return {"square": x * x}
 
 
-def deadly(x, log, once=(), always=(), slow=()):
-    """Kills its own process at some points, once or always."""
+def deadly(x, log, once):
+    """Kills its own process when it comes to a point for the first time."""
     note(log, x)
-    if x in slow:
-        time.sleep(1.0)
-    if x in always or (x in once and noted(log).count(str(x)) == 1):
+    if x == once and noted(log).count(str(x)) == 1:
         time.sleep(0.2)  # others are under way
         os.kill(os.getpid(), signal.SIGKILL)
     return {"square": x * x}
 
 
 def surroundings():
-    return {"threads": os.environ.get("MPMOPT_THREADS", ""), "process": os.getpid()}
+    threads = [os.environ.get(name) for name in ("MPMOPT_THREADS", "OPENBLAS_NUM_THREADS")]
+    return {"threads": str(threads), "process": os.getpid()}
 
 
 def gradient(scene, phi):
     import numpy as np
 
-    from mpmopt.problem import Problem
+    from mpmopt.design.problem import Problem
     from mpmopt.scene import Scene
 
     problem = Problem(Scene.from_json(scene))

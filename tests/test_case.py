@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import climber
 import crawler
@@ -14,13 +15,15 @@ import numpy as np
 import pytest
 from walker import CASES, slanted_legs, walker
 
-from mpmopt import plot, runfile
-from mpmopt.binary import pieces
-from mpmopt.case import START, Case, ProgressBar, main, resume, run
+from mpmopt.app.case import START, Case, ProgressBar, resume, run
+from mpmopt.app.script import main
+from mpmopt.assess.threshold import pieces
+from mpmopt.design.problem import Problem
 from mpmopt.errors import DesignError, RunFileError, StorageError
-from mpmopt.files import MARK
-from mpmopt.optimize import Settings, Stage, optimise
-from mpmopt.problem import Problem
+from mpmopt.optimisation.loop import optimise
+from mpmopt.optimisation.settings import Settings, Stage
+from mpmopt.results import runfile
+from mpmopt.view import plot
 
 SMALL = Case(
     walker(64, 8e-4),
@@ -45,6 +48,7 @@ def folder(tmp_path_factory):
     return out, run(SMALL, out)
 
 
+@pytest.mark.case
 def test_a_small_walker_walks_even_without_its_void(folder):
     out, summary = folder
     assert summary["start"] == pytest.approx(13 / 64, abs=1e-9)
@@ -57,12 +61,15 @@ def test_a_small_walker_walks_even_without_its_void(folder):
     )
     assert summary["actuation_off"] < summary["post_processed"]
     assert summary["failed_evaluations"] == 0
-    kept = runfile.read(out / "run.h5")
-    there = kept.problem().gamma(kept.best) >= 0.3
-    assert summary["loose_particles"] == (pieces(kept.problem().scene, there) > 0).sum() <= 12
+    kept = runfile.read_run(out / "run.h5").run
+    there = kept.problem().gamma(kept.result.x) >= 0.3
+    assert (
+        summary["disconnected_particles"] == (pieces(kept.problem().scene, there) > 0).sum() <= 12
+    )
     assert summary["evaluations"] <= 30
 
 
+@pytest.mark.case
 def test_a_small_crawler_crawls_even_without_its_void(tmp_path):
     case = Case(crawler.crawler(64, 8e-4), SMALL.settings, crawler.slanted_legs)
     summary = run(case, tmp_path)
@@ -75,6 +82,7 @@ def test_a_small_crawler_crawls_even_without_its_void(tmp_path):
     assert summary["failed_evaluations"] == 0
 
 
+@pytest.mark.case
 def test_a_small_climber_climbs_even_without_its_void(tmp_path):
     settings = dataclasses.replace(SMALL.settings, least_iterations=10, most_iterations=10)
     case = Case(climber.climber(64, 8e-4), settings, climber.slanted_legs, climber.START)
@@ -88,8 +96,14 @@ def test_a_small_climber_climbs_even_without_its_void(tmp_path):
     assert np.ptp(summary["theta"]) >= 0.5
 
 
+@pytest.mark.case
 def test_a_case_starts_where_it_says_or_a_turn_of_phases_away(tmp_path):
-    start = {"phi": 0.5, "a": (0.9, 0.8, 0.7), "theta": (0.9, -0.9, 0.2), "b": (0.0, -0.1, -0.2)}
+    start: dict[str, Any] = {
+        "phi": 0.5,
+        "a": (0.9, 0.8, 0.7),
+        "theta": (0.9, -0.9, 0.2),
+        "b": (0.0, -0.1, -0.2),
+    }
     once = Settings(
         SMALL.settings.stages[:1], window=1, least_iterations=1, most_iterations=1, scouting=1
     )
@@ -109,18 +123,17 @@ def test_the_folder_holds_run_summary_and_pictures(folder):
     assert json.loads((out / "summary.json").read_text()) == summary
     assert set(summary) >= {
         "start", "reference", "reference_drawn", "optimised", "post_processed", "a", "theta", "b",
-        "evaluations", "failed_evaluations", "redone_evaluations", "seconds", "stop_reason",
+        "evaluations", "failed_evaluations", "halved_evaluations", "seconds", "stop_reason",
     }  # fmt: skip
     for picture in ("design.png", "history.png"):
         data = (out / picture).read_bytes()
         assert data.startswith(b"\x89PNG")
         assert len(data) >= 20_000
-        assert MARK.encode() in data  # so that `mpmopt plot` may replace it
-    kept = runfile.read(out / "run.h5")
-    assert kept.scene == SMALL.scene
-    assert kept.stop_reason == summary["stop_reason"]
+    kept = runfile.read_run(out / "run.h5")
     assert kept.summary == summary
-    assert kept.problem().value(kept.best) == summary["optimised"]
+    assert kept.run.scene == SMALL.scene
+    assert kept.run.stop_reason == summary["stop_reason"]
+    assert kept.run.problem().value(kept.run.result.x) == summary["optimised"]
 
 
 def test_a_finished_run_is_left_as_it_is(folder):
@@ -152,7 +165,7 @@ def test_a_picture_that_fails_spoils_no_run(tmp_path, caplog, monkeypatch, how):
         if how == "the picture fails":
             patch.setattr(plot, "plot_motion", fails)
         else:
-            patch.setitem(sys.modules, "mpmopt.plot", None)
+            patch.setitem(sys.modules, "mpmopt.view.plot", None)
         summary = run(TINY, tmp_path)
     first, *others = (message for message in caplog.messages if "png" in message)
     if how == "the picture fails":
@@ -163,7 +176,7 @@ def test_a_picture_that_fails_spoils_no_run(tmp_path, caplog, monkeypatch, how):
         assert len(others) == 1
     assert not (tmp_path / "design.png").exists()
     assert json.loads((tmp_path / "summary.json").read_text()) == summary
-    assert runfile.read(tmp_path / "run.h5").summary == summary
+    assert runfile.read_run(tmp_path / "run.h5").summary == summary
     assert run(TINY, tmp_path) == resume(tmp_path / "run.h5") == summary
 
 
@@ -173,7 +186,7 @@ def test_a_start_is_filled_up_and_knows_its_names():
         dataclasses.replace(TINY, start={"omega": 0.1})
 
 
-def test_foreign_files_are_overwritten_only_by_force(tmp_path):
+def test_what_a_folder_holds_is_overwritten_only_by_force(tmp_path):
     (tmp_path / "design.png").write_text("somebody's")
     with pytest.raises(StorageError, match=r"design\.png is there already.*--force"):
         run(TINY, tmp_path)
@@ -225,7 +238,7 @@ def test_progress_becomes_log_lines_off_a_terminal(capsys):
     optimise(scene, settings, start, [ProgressBar()])
     lines = capsys.readouterr().err.splitlines()
     assert [line.split()[0] for line in lines] == ["10", "20"]
-    assert "greyness" in lines[0]
+    assert "non-discreteness" in lines[0]
 
 
 def test_the_walkers_settings_are_those_of_the_design():
@@ -233,9 +246,9 @@ def test_the_walkers_settings_are_those_of_the_design():
     assert (preview.scene.grid.cells[0], preview.scene.time_step) == (64, 8e-4)
     assert (default.scene.grid.cells[0], default.scene.time_step) == (128, 5e-4)
     fine = [s for s in default.settings.stages if s.coarsening == 1]
-    assert {(s.mass_floor, s.stiffness_floor, s.time_step) for s in fine} == {(1e-2, 1e-3, 5e-4)}
+    assert {(s.void_density, s.void_stiffness, s.time_step) for s in fine} == {(1e-2, 1e-3, 5e-4)}
     assert (paper.scene.grid.cells[0], paper.scene.steps) == (128, 5000)
-    assert {(s.mass_floor, s.stiffness_floor) for s in paper.settings.stages} == {(1e-3, 1e-3)}
+    assert {(s.void_density, s.void_stiffness) for s in paper.settings.stages} == {(1e-3, 1e-3)}
     assert [s.beta for s in paper.settings.stages] == [0.5, 1.0, 2.0, 4.0, 8.0, 16.0]
     for case in CASES.values():
         for stage in case.settings.stages:
@@ -252,6 +265,7 @@ def start_up(tmp_path, what, root=ROOT):
     return done.stdout.split()
 
 
+@pytest.mark.process
 def test_importing_the_package_imports_nothing_heavy(tmp_path):
     modules = start_up(
         tmp_path, "import sys, mpmopt; from mpmopt import scene; print(*sys.modules)"
@@ -262,21 +276,24 @@ def test_importing_the_package_imports_nothing_heavy(tmp_path):
 FALL = """
 import sys
 import numpy as np
-from mpmopt import mpm
-from mpmopt.interrupt import reported
-from mpmopt.particles import lay_out
-from mpmopt.problem import Problem
+from mpmopt import kernels
+from mpmopt.io.console import reported
+from mpmopt.scene.particles import discretise
+from mpmopt.design.problem import Problem
 from mpmopt.scene import Grid, Scene, Solid
 scene = Scene(Grid((8, 8), 0.125), 1e-2, 10, gravity=(1.0, 0.0),
               body=(Solid((0.25, 0.25), (0.5, 0.5)),))
-start = lay_out(scene).position[:, 0].mean()
-stats = mpm.advance.stats
-sys.exit(reported(lambda: print((Problem(scene, redo=0).value(np.empty(0)) - start).hex(),
+start = discretise(scene).position[:, 0].mean()
+stats = kernels.advance.stats
+def value():
+    return Problem(scene, halvings=0, limits=None).value(np.empty(0))
+sys.exit(reported(lambda: print((value() - start).hex(),
                                 sum(stats.cache_hits.values()), sum(stats.cache_misses.values())),
                   lambda: ""))
 """
 
 
+@pytest.mark.cache
 def test_kernels_come_from_the_cache_to_the_same_bits_but_never_once_edited(tmp_path, monkeypatch):
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
     shutil.copytree(ROOT / "mpmopt", tmp_path / "mpmopt")
@@ -285,7 +302,7 @@ def test_kernels_come_from_the_cache_to_the_same_bits_but_never_once_edited(tmp_
     warm, *loaded = start_up(tmp_path, FALL, tmp_path)
     assert loaded == ["1", "0"]
     assert warm == cold
-    kernels = tmp_path / "mpmopt" / "mpm.py"
+    kernels = tmp_path / "mpmopt" / "kernels" / "grid.py"
     text = kernels.read_text()
     gravity = "fused(grid[0, node, 0], per_m, world.dt * world.gravity_x),\n"
     assert text.count(gravity) == 1
@@ -299,6 +316,7 @@ def test_kernels_come_from_the_cache_to_the_same_bits_but_never_once_edited(tmp_
         start_up(tmp_path, FALL, tmp_path)
 
 
+@pytest.mark.case
 def test_the_example_in_the_readme_goes_farther(capsys):
     text = (ROOT / "README.md").read_text()
     example = text.split("```python\n")[1].split("```")[0]
@@ -310,7 +328,7 @@ def test_the_example_in_the_readme_goes_farther(capsys):
 PAPER = """
 from pathlib import Path
 from walker import CASES
-from mpmopt.problem import Problem
+from mpmopt.design.problem import Problem
 stage = CASES["paper"].settings.stages[0]
 problem = Problem(stage.scene(CASES["paper"].scene), stage.beta)
 problem.value_and_gradient(problem.join(0.1, 1.0, -0.3, -0.5))
@@ -321,6 +339,7 @@ print(problem.scene.steps, peak // 1000)
 """
 
 
+@pytest.mark.process
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="only Linux tells")
 def test_a_gradient_of_the_papers_size_needs_less_than_half_a_gigabyte(tmp_path):
     steps, megabytes = start_up(tmp_path, PAPER)

@@ -3,6 +3,7 @@
 import math
 import resource
 import shutil
+from typing import Any
 
 import h5py
 import numpy as np
@@ -10,12 +11,12 @@ import pytest
 from conftest import small_scene
 from walker import walker
 
-from mpmopt.checkpoints import MEGABYTE, Checkpointing, Checkpoints, Schedule
+from mpmopt.design.objective import Objective
+from mpmopt.design.problem import Problem
 from mpmopt.errors import DesignError, StorageError
-from mpmopt.objective import Objective
-from mpmopt.particles import lay_out
-from mpmopt.problem import Problem
-from mpmopt.simulate import Simulation
+from mpmopt.scene.particles import discretise
+from mpmopt.simulation.checkpoints import MEGABYTE, Checkpointing, Checkpoints, Schedule
+from mpmopt.simulation.simulation import Simulation
 
 SIZE = 1000  # bytes of a step
 
@@ -83,7 +84,7 @@ def test_senseless_wishes_are_refused(wrong):
 @pytest.fixture(scope="module")
 def rough_walker():
     """The preview's walker with a random design, 250 steps of it, and its gradient."""
-    scene = walker(64, 8e-4).vary(mass_floor=1e-2, stiffness_floor=1e-3)
+    scene = walker(64, 8e-4).vary(void_density=1e-2, void_stiffness=1e-3)
     scene = type(scene)(**{**vars(scene), "steps": 250})
     problem = Problem(scene, beta=2.0)
     design = np.random.default_rng(3).uniform(-1.0, 1.0, problem.size - 3)
@@ -138,7 +139,7 @@ def test_the_scratch_file_is_removed_when_the_simulation_fails(rough_walker, tmp
     def fail(*_):
         raise RuntimeError("stop")
 
-    monkeypatch.setattr("mpmopt.simulate.Forward.reverse", fail)
+    monkeypatch.setattr("mpmopt.simulation.simulation.Forward.reverse", fail)
     with pytest.raises(RuntimeError, match="stop"):
         Problem(scene, 2.0, Checkpointing(every=50, store="disk")).value_and_gradient(x)
     assert list(tmp_path.iterdir()) == []
@@ -201,7 +202,7 @@ def test_a_kept_store_is_replaced_only_by_a_complete_one(rough_walker, tmp_path,
     problem = Problem(scene, 2.0, Checkpointing(every=50, store=kept))
     problem.value_and_gradient(x)
     before = kept.read_bytes()
-    monkeypatch.setattr("mpmopt.simulate.Forward.reverse", lambda *_: 1 / 0)
+    monkeypatch.setattr("mpmopt.simulation.simulation.Forward.reverse", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         problem.value_and_gradient(0.5 * x)
     assert kept.read_bytes() == before
@@ -228,10 +229,10 @@ def test_going_back_twice_is_refused(rough_walker, every):
     simulation = problem.simulation(x)
     with simulation.checkpoints(Checkpointing(every)) as checkpoints:
         forward = simulation.forward(checkpoints)
-        seed = problem.objective(simulation).seed(forward.state)
-        forward.reverse(seed)
+        seeds = problem.objective(simulation).terminal_adjoints(forward.states)
+        forward.reverse(seeds)
         with pytest.raises(DesignError, match="run forward again"):
-            forward.reverse(seed)
+            forward.reverse(seeds)
 
 
 def test_a_store_that_lost_its_data_says_so(tmp_path):
@@ -248,7 +249,7 @@ def test_windows_that_outgrow_the_store_are_recomputed():
     scene = small_scene(walls=(), gravity=(0.0, 0.0), steps=40)
     gradients = []
     for every in ("all", 40):
-        particles = lay_out(scene)
+        particles = discretise(scene)
         ones = np.ones(48)
         state = np.zeros((12, 48))
         state[0:2] = particles.position.T
@@ -258,9 +259,51 @@ def test_windows_that_outgrow_the_store_are_recomputed():
         simulation = Simulation(scene, particles, ones, weak, weak, np.zeros((40, 2)), state)
         with simulation.checkpoints(Checkpointing(every, store="memory")) as checkpoints:
             forward = simulation.forward(checkpoints)
-            seed = Objective.of(particles, (0.6, 0.8)).seed(forward.state)
-            gradients.append(forward.reverse(seed))
+            objective = Objective.of(scene, particles, (0.6, 0.8))
+            gradients.append(forward.reverse(objective.terminal_adjoints(forward.states)))
         if every == "all":
             assert forward.recomputed_segments >= 1
     assert np.array_equal(gradients[0].state, gradients[1].state)
     assert np.array_equal(gradients[0].density, gradients[1].density)
+
+
+@pytest.mark.parametrize("every", [1, 5, 8, "all", None])
+def test_any_states_can_be_asked_for_and_have_their_adjoints_added_on_the_way_back(rng, every):
+    # Of a sum over some states, at the ends of segments and within: the complex step.
+    scene, instants = small_scene(steps=16), (0, 3, 5, 8, 15)
+    problem = Problem(scene)
+    x = problem.join(0.2, 0.9, -0.3, -0.5)
+    simulation = problem.simulation(x)
+    weight = {step: rng.standard_normal(simulation.initial.shape) for step in (*instants, 16)}
+    with simulation.checkpoints(Checkpointing(every, store="memory")) as store:
+        forward = simulation.forward(store, instants=instants)
+        assert sorted(forward.states) == sorted(weight)
+        kept = {step: state.copy() for step, state in forward.states.items()}
+        gradient = forward.reverse(weight)
+    states = simulation.run(sorted(weight))
+    watched = simulation.watch(instants).states
+    for step, state in zip(sorted(weight), states):
+        assert np.array_equal(kept[step], state)
+        assert np.array_equal(watched[step], state)
+    direction = rng.standard_normal(simulation.initial.shape)
+    simulation = problem.simulation(x + 0j)
+    simulation.initial += 1e-30j * direction
+    moved = simulation.run(sorted(weight)).imag / 1e-30
+    terms = [weight[step] * state for step, state in zip(sorted(weight), moved)]
+    difference = np.sum(terms) - np.sum(gradient.state * direction)
+    assert abs(difference) <= 1e-12 * np.linalg.norm(terms)
+
+
+def test_instants_and_seeds_that_are_none_are_refused():
+    problem = Problem(small_scene(steps=4))
+    simulation = problem.simulation(problem.join(0.2, 0.9, -0.3, -0.5))
+    wrong: Any
+    for wrong in ([5], [-1], [1.5]):
+        with pytest.raises(DesignError, match="instants must be whole numbers of steps from 0 to"):
+            simulation.watch(wrong)
+    for seeds in ({5: simulation.initial}, {-1: simulation.initial}, {4: np.zeros(3)}):
+        with (
+            simulation.checkpoints(Checkpointing(store="memory")) as store,
+            pytest.raises(DesignError, match=r"seeds has shape .* must have \(12, 48\) at steps"),
+        ):
+            simulation.forward(store).reverse(seeds)

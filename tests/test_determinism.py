@@ -14,9 +14,10 @@ import numpy as np
 import pytest
 from walker import walker
 
-from mpmopt.checkpoints import Checkpointing
-from mpmopt.optimize import Settings, Stage, optimise
-from mpmopt.problem import Problem
+from mpmopt.design.problem import Problem
+from mpmopt.optimisation.loop import optimise
+from mpmopt.optimisation.settings import Settings, Stage
+from mpmopt.simulation.checkpoints import Checkpointing
 
 
 def short_run(checkpointing=None):

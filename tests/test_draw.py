@@ -3,11 +3,13 @@
 import numpy as np
 import pytest
 from conftest import small_scene
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.patches import Rectangle
 
-from mpmopt.draw import BLUE, RED, Squares, draw_walls, format_of, new_figure, set_view
-from mpmopt.motion import Motion, optimised, reference
-from mpmopt.problem import Problem
+from mpmopt.assess.trajectory import Motion, optimised, reference
+from mpmopt.design.problem import Problem
 from mpmopt.scene import Grid, Scene, Solid, Wall
+from mpmopt.view.draw import BLUE, RED, Squares, draw_walls, format_of, new_figure, set_view
 
 
 def drawn(motion, box, frame=0):
@@ -18,8 +20,9 @@ def drawn(motion, box, frame=0):
     axes.set_axis_off()
     set_view(axes, np.array(box))
     axes.add_collection(Squares(motion, frame), autolim=False)
-    figure.canvas.draw()
-    picture = np.array(figure.canvas.buffer_rgba())[..., :3] / 255.0
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    picture = np.array(canvas.buffer_rgba())[..., :3] / 255.0
 
     def colour(points):
         x, y = np.floor(axes.transData.transform(points)).astype(int).T
@@ -62,7 +65,7 @@ def test_grey_is_gamma_and_red_and_blue_are_the_sign_of_the_signal():
     gamma, actuation = [0.0, 0.5, 1.0, 1.0, 1.0, 1.0], [0.0, 0.0, 0.0, 1.0, -1.0, 0.5]
     motion = made_up(position, np.tile(np.eye(2), (6, 1, 1)), gamma, actuation)
     _, colour = drawn(motion, [(0.1, 0.1), (0.8, 0.3)])
-    wanted = [(1, 1, 1), (0.5, 0.5, 0.5), (0, 0, 0), RED, BLUE, 0.5 * np.array(RED)]
+    wanted = np.array([(1, 1, 1), (0.5, 0.5, 0.5), (0, 0, 0), RED, BLUE, 0.5 * np.array(RED)])
     assert np.allclose(colour(position), wanted, atol=1 / 255)
 
 
@@ -132,6 +135,7 @@ def test_walls_are_drawn_where_bodies_rest_on_them(place, side, gravity):
     set_view(axes, np.array([(0.0, 0.0), (1.0, 1.0)]))
     draw_walls(axes, scene, moving=True)
     (wall,) = axes.patches
+    assert isinstance(wall, Rectangle)
     line = wall.get_y() + (wall.get_height() if side == "below" else 0.0)
     assert abs(edge - line) <= 0.2 * dx
 

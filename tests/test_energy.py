@@ -10,20 +10,22 @@ from stability.common import at_rest, solid
 from stability.time_step import block_scene
 from walker import slanted_legs, walker
 
-from mpmopt import energy, mpm
-from mpmopt.binary import distance, post_processed
-from mpmopt.checkpoints import Checkpointing
-from mpmopt.errors import DesignError, SimulationError, TornError
-from mpmopt.particles import lay_out
-from mpmopt.problem import LIMITS, Problem, Variables
+from mpmopt import kernels
+from mpmopt.assess.threshold import distance, post_processed
+from mpmopt.assess.verify import COMPLEX_STEP
+from mpmopt.design.problem import Problem, Variables
+from mpmopt.design.step_control import LIMITS
+from mpmopt.errors import DesignError, FractureError, SimulationError
 from mpmopt.scene import Actuator, Grid, Scene, Solid, Wall
-from mpmopt.simulate import Simulation
-from mpmopt.verify import COMPLEX_STEP
+from mpmopt.scene.particles import discretise
+from mpmopt.simulation import energy
+from mpmopt.simulation.checkpoints import Checkpointing
+from mpmopt.simulation.simulation import Simulation
 
 
 def totals(simulation, state):
     """Energy of a state, and what each actuator squeezes."""
-    records = mpm.grouped(state)
+    records = kernels.grouped(state)
     held = np.zeros((1, simulation.signal.shape[1]))
     body, world = simulation.body, simulation.world
     energy.grips(records[None], np.zeros(1, np.int64), body, world, held)
@@ -39,7 +41,7 @@ def one_step(dt, rng):
         Solid((8 * c, 4 * c), (9 * c, 7 * c)),
     )
     scene = small_scene(body=body, steps=1, time_step=dt, gravity=(2.0, -5.0), walls=())
-    particles = lay_out(scene)
+    particles = discretise(scene)
     state = at_rest(particles)
     rate = rng.uniform(-1.0, 1.0, (2, 2))
     state[2:4] = rate @ (state[0:2] - 0.4)
@@ -66,7 +68,7 @@ def test_what_a_step_gains_is_what_the_actuators_give():
 
 
 def margin(simulation):
-    return simulation.watch().margins.energy
+    return simulation.watch().indicators.energy
 
 
 @pytest.mark.parametrize("precision", ["double", "single"])
@@ -108,10 +110,10 @@ def test_the_balance_is_the_same_for_every_schedule_and_for_complex_numbers():
     problem, x = lively()
     simulation = problem.simulation(x)
     simulation.initial[2] += 3.0 * simulation.initial[1]  # it shears: not zero to begin with
-    expected = simulation.watch().margins
+    expected = simulation.watch().indicators
     for every in (1, 7, 100, "all"):
         with simulation.checkpoints(Checkpointing(every=every)) as checkpoints:
-            assert simulation.forward(checkpoints).margins == expected
+            assert simulation.forward(checkpoints).indicators == expected
     complex_one = problem.simulation(x + 1j * COMPLEX_STEP)
     assert margin(complex_one) == pytest.approx(margin(problem.simulation(x)), abs=1e-12)
 
@@ -120,7 +122,7 @@ def test_the_balance_is_the_same_for_every_schedule_and_for_complex_numbers():
 def test_a_step_that_is_unstable_makes_energy(courant, least, most):
     # Free blocks are stable up to 1.10; 50 steps later a particle is inverted.
     scene = block_scene(steps=50)
-    particles = lay_out(scene)
+    particles = discretise(scene)
     state, speed = at_rest(particles), scene.material.wave_speed
     state[2:8] = 1e-6 * speed * np.random.default_rng(1).uniform(-1.0, 1.0, state[2:8].shape)
     assert least <= margin(solid(scene, particles, state, time_step=courant / speed)) <= most
@@ -129,7 +131,7 @@ def test_a_step_that_is_unstable_makes_energy(courant, least, most):
 def test_an_evaluation_in_which_energy_appears_fails_and_says_so(monkeypatch):
     problem, x = lively()
     problem.value_and_gradient(x)
-    monkeypatch.setattr("mpmopt.energy.Balance.appeared", 1.01 * LIMITS.energy)
+    monkeypatch.setattr("mpmopt.simulation.energy.Balance.appeared", 1.01 * LIMITS.energy)
     for function in (problem.value, problem.value_and_gradient):
         with pytest.raises(
             SimulationError, match=r"energy that appears from nowhere reached 0\.05"
@@ -137,7 +139,7 @@ def test_an_evaluation_in_which_energy_appears_fails_and_says_so(monkeypatch):
             function(x)
     with pytest.raises(SimulationError, match="energy that appears"):
         post_processed(problem, x)
-    Problem(problem.scene, 2.0, redo=0).value_and_gradient(x)
+    Problem(problem.scene, 2.0, halvings=0, limits=None).value_and_gradient(x)
 
 
 def test_a_body_without_void_that_is_torn_has_no_distance():
@@ -148,10 +150,10 @@ def test_a_body_without_void_that_is_torn_has_no_distance():
         replace(part, stress=((stress, 0.0), (0.0, stress))) if isinstance(part, Actuator) else part
         for part in scene.body
     )
-    particles = lay_out(scene)
+    particles = discretise(scene)
     keep = slanted_legs(particles.position[particles.designed])
     push = Variables(np.zeros(0), np.ones(1), np.array([-0.3]), -np.ones(1))
-    with pytest.raises(TornError, match="solid is stretched"):
+    with pytest.raises(FractureError, match="solid is stretched"):
         distance(replace(scene, body=body), keep, push)
     assert np.isfinite(distance(scene, keep, push))
 

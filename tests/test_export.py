@@ -4,6 +4,7 @@ import dataclasses
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,10 +18,9 @@ from vtkmodules.util.numpy_support import vtk_to_numpy
 from vtkmodules.vtkIOHDF import vtkHDFReader
 from walker import walker
 
-from mpmopt import export as exporting
-from mpmopt import runfile
 from mpmopt.__main__ import main
-from mpmopt.binary import pieces, solid_body
+from mpmopt.assess.threshold import pieces, solid_body
+from mpmopt.design.problem import Problem
 from mpmopt.errors import (
     DesignError,
     ExportError,
@@ -28,13 +28,15 @@ from mpmopt.errors import (
     SimulationError,
     StorageError,
 )
-from mpmopt.export import export, in_millimetres, stl
-from mpmopt.history import Candidate
-from mpmopt.optimize import Settings, Stage, begin
-from mpmopt.outline import outline
-from mpmopt.particles import lay_out, mirror_images
-from mpmopt.problem import Problem
+from mpmopt.optimisation.history import Candidate
+from mpmopt.optimisation.loop import begin
+from mpmopt.optimisation.settings import Settings, Stage
+from mpmopt.results import export as exporting
+from mpmopt.results import runfile
+from mpmopt.results.export import export, in_millimetres, stl
+from mpmopt.results.outline import outline
 from mpmopt.scene import Design, Grid, Mirror, Scene, Solid
+from mpmopt.scene.particles import discretise, mirror_images
 
 WIDTH = 60.0  # mm
 C = 1 / 32
@@ -66,7 +68,7 @@ def holed():
 
 def mask(problem, x):
     """Which cells of the particles' lattice are solid, with a ring of empty ones around them."""
-    body = lay_out(problem.scene, whole=True)
+    body = discretise(problem.scene, whole=True)
     there = np.ones(len(problem.particles.position), dtype=bool)
     there[problem.particles.designed] = problem.gamma(x) >= 0.3
     there = there[mirror_images(problem.scene, problem.particles, body)]
@@ -82,10 +84,10 @@ def counted(problem, x):
     return label(lattice)[1], label(~lattice, np.ones((3, 3)))[1] - 1
 
 
-def particles_area(problem, x, drop_loose=False):
+def particles_area(problem, x, drop_components=False):
     """Of the bar and what is kept of the block, in square millimetres."""
     piece = pieces(problem.scene, problem.gamma(x) >= 0.3)
-    kept = (piece == 0) if drop_loose else (piece >= 0)
+    kept = (piece == 0) if drop_components else (piece >= 0)
     return (48 * 8 + kept.sum()) * (WIDTH / 48) ** 2
 
 
@@ -148,7 +150,7 @@ def test_straight_sides_stay_straight(holed):
 def test_a_loose_ring_around_what_is_solid_is_dropped():
     scene = block()
     core = Solid((14 * C, 14 * C), (18 * C, 18 * C))
-    around = ((4, 4), (28, 14)), ((4, 14), (14, 18)), ((18, 14), (28, 18)), ((4, 18), (28, 24))
+    around: Any = ((4, 4), (28, 14)), ((4, 14), (14, 18)), ((18, 14), (28, 18)), ((4, 18), (28, 24))
     design = (Design(*(tuple(C * k for k in corner) for corner in box)) for box in around)
     problem = Problem(dataclasses.replace(scene, body=(core, *design)), beta=16.0)
     ring = discs(problem, (16, 16, 7), inside=1.0)
@@ -162,7 +164,7 @@ def test_a_loose_ring_around_what_is_solid_is_dropped():
 @pytest.mark.parametrize("loose", [False, True])
 def test_an_svg_is_read_back_with_area_pieces_holes_and_size(holed, tmp_path, loose):
     problem, x = holed
-    export(problem, x, tmp_path, ["svg"], width=WIDTH, drop_loose=loose)
+    export(problem, x, tmp_path, ["svg"], width=WIDTH, drop_components=loose)
     image = svgelements.SVG.parse(str(tmp_path / "design.svg"), ppi=25.4)  # one pixel is 1 mm
     paths = [element for element in image.elements() if isinstance(element, svgelements.Path)]
     holes = area = 0
@@ -347,12 +349,12 @@ def test_the_motion_is_read_back_by_vtk(tmp_path, mirror):
         expected = np.where(actuator >= 0, simulation.signal[min(step, 39)][actuator], 0.0)
         assert frame["signal"][:count] == pytest.approx(expected, abs=1e-6)
         if mirror:
+            assert scene.mirror is not None
             velocity = frame["velocity"][count:, :2] * (1.0, -1.0)
             assert velocity == pytest.approx(frame["velocity"][:count, :2], abs=1e-6)
             assert np.array_equal(frame["signal"][count:], frame["signal"][:count])
             image = centre[count:, :2] * (1.0, -1.0) + (0.0, 2 * scene.mirror.position)
             assert image == pytest.approx(centre[:count, :2], abs=1e-6)
-            areas = np.array(areas)
             assert areas[count:] == pytest.approx(areas[:count], rel=1e-3)
 
 
@@ -361,7 +363,7 @@ def test_drawing_motion_and_count_agree_on_what_is_loose(tmp_path, seed):
     """Ragged designs, whose outlines part and join what neighbours on the lattice do not."""
     problem = Problem(block(), beta=8.0)
     x = np.random.default_rng(seed).choice([-1.0, 1.0], size=problem.size)
-    done = export(problem, x, tmp_path, ["svg", "vtk"], scale=1.0, drop_loose=True)
+    done = export(problem, x, tmp_path, ["svg", "vtk"], scale=1.0, drop_components=True)
     _, frames = read_motion(tmp_path / "motion.vtkhdf")
     moving = frames[0]["corners"].mean(axis=1)[:, :2]
     position = problem.particles.position
@@ -388,7 +390,7 @@ def test_of_a_mirror_scene_all_loose_particles_are_counted(tmp_path):
     x = problem.join(rng.choice([-1.0, 1.0], size=problem.size - 3), 1.0, -0.3, -0.5)
     counts = []
     for drop in (False, True):
-        done = export(problem, x, tmp_path, ["vtk"], drop_loose=drop)
+        done = export(problem, x, tmp_path, ["vtk"], drop_components=drop)
         counts.append(len(read_motion(tmp_path / "motion.vtkhdf")[1][0]["corners"]))
     assert done.loose == counts[0] - counts[1] >= 2
 
@@ -417,36 +419,38 @@ def test_sizes_that_make_no_sense_are_refused_and_nothing_is_written(
     holed, tmp_path, formats, options, what
 ):
     with pytest.raises(ExportError, match=what):
-        export(*holed, tmp_path, formats, **options)
+        export(holed[0], holed[1], tmp_path, formats, **options)
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("threshold", [0.0, 1.0, -0.3, np.nan])
 def test_a_threshold_outside_0_to_1_is_refused(holed, tmp_path, threshold):
     with pytest.raises(DesignError, match="between 0 and 1"):
-        export(*holed, tmp_path, ["vtk"], threshold=threshold)
+        export(holed[0], holed[1], tmp_path, ["vtk"], threshold=threshold)
 
 
 @pytest.mark.parametrize(("name", "package"), [("dxf", "ezdxf"), ("stl", "manifold3d")])
 def test_a_missing_extra_says_what_to_install(holed, tmp_path, monkeypatch, name, package):
     monkeypatch.setitem(sys.modules, package, None)
     with pytest.raises(MissingLibraryError, match=rf'{package}: pip install "mpmopt\[export\]"'):
-        export(*holed, tmp_path, ["svg", name], width=60.0)
+        export(holed[0], holed[1], tmp_path, ["svg", name], width=60.0)
     assert not list(tmp_path.iterdir())
-    export(*holed, tmp_path, ["svg"], width=60.0)
+    export(holed[0], holed[1], tmp_path, ["svg"], width=60.0)
 
 
 def test_a_folder_that_cannot_be_made_is_a_storage_error(holed, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(StorageError, match="another folder"):
-        export(*holed, tmp_path / "file" / "folder", ["svg"], width=60.0)
+        export(holed[0], holed[1], tmp_path / "file" / "folder", ["svg"], width=60.0)
 
 
 def run_file(path, problem, x):
     """A run file with a design, as if it had been found."""
     stage = Stage(problem.chain.beta, 1e-2, 1e-3, problem.scene.time_step)
     run = begin(problem.scene, Settings((stage,)), x)
-    numbers = dict.fromkeys(("move_limit", "greyness", "projected_gradient", "step"), 0.1)
+    numbers: Any = dict.fromkeys(
+        ("move_limit", "non_discreteness", "projected_gradient", "step"), 0.1
+    )
     item = Candidate(
         start=0, stage=0, beta=stage.beta, time_step=stage.time_step, objective=0.5,
         seconds=1.0, x=x, gamma=problem.gamma(x), **numbers,
@@ -457,10 +461,11 @@ def run_file(path, problem, x):
     return path
 
 
+@pytest.mark.process
 def test_the_command_writes_all_four_and_says_how_large_it_all_is(holed, tmp_path):
     path = run_file(tmp_path / "run.h5", *holed)
     (tmp_path / "design.svg").write_text("an older one")
-    options = ["--svg", "--dxf", "--stl", "--vtk", "--width", "60", "--drop-loose", "--force"]
+    options = ["--svg", "--dxf", "--stl", "--vtk", "--width", "60", "--drop-components", "--force"]
     done = subprocess.run(
         [sys.executable, "-m", "mpmopt", "export", str(path), *options],
         capture_output=True, text=True, timeout=120, cwd=Path(__file__).parent.parent,
@@ -478,7 +483,9 @@ def test_the_command_writes_all_four_and_says_how_large_it_all_is(holed, tmp_pat
     assert mesh.bounds[1] == pytest.approx([60.0, 50.0, 6.0], abs=1e-5)
     assert mesh.body_count == 1
     _, frames = read_motion(tmp_path / "motion.vtkhdf")
-    assert len(frames[0]["corners"]) == round(particles_area(*holed, True) / (WIDTH / 48) ** 2)
+    assert len(frames[0]["corners"]) == round(
+        particles_area(holed[0], holed[1], True) / (WIDTH / 48) ** 2
+    )
 
 
 def test_a_motion_that_fails_takes_nothing_else_with_it(
@@ -489,7 +496,7 @@ def test_a_motion_that_fails_takes_nothing_else_with_it(
 
     monkeypatch.setattr(exporting.Motion, "of", bursts)
     path, out = run_file(tmp_path / "run.h5", *holed), tmp_path / "out"
-    options = ["--svg", "--dxf", "--stl", "--vtk", "--width", "60", "--drop-loose"]
+    options = ["--svg", "--dxf", "--stl", "--vtk", "--width", "60", "--drop-components"]
     assert main(["export", str(path), *options, "--out", str(out)]) == 1
     assert {file.name for file in out.iterdir()} == {"design.svg", "design.dxf", "design.stl"}
     printed = capsys.readouterr().out
@@ -497,18 +504,18 @@ def test_a_motion_that_fails_takes_nothing_else_with_it(
     (warning,) = caplog.messages
     assert warning.startswith("no motion.vtkhdf: step 3, body: it burst")
     with pytest.raises(SimulationError, match="it burst"):
-        export(*holed, tmp_path / "none", ["vtk"])
+        export(holed[0], holed[1], tmp_path / "none", ["vtk"])
     assert not (tmp_path / "none").exists()
 
 
 def test_a_file_that_cannot_be_written_takes_nothing_else_with_it(holed, tmp_path, caplog):
     (tmp_path / "design.svg").mkdir()
-    done = export(*holed, tmp_path, ["svg", "stl"], width=60.0)
+    done = export(holed[0], holed[1], tmp_path, ["svg", "stl"], width=60.0)
     assert done.paths == (tmp_path / "design.stl",)
     assert done.failed == ("svg",)
     assert caplog.messages[0].startswith("no design.svg: cannot write")
     with pytest.raises(StorageError, match=r"design\.svg"):
-        export(*holed, tmp_path, ["svg"], width=60.0)
+        export(holed[0], holed[1], tmp_path, ["svg"], width=60.0)
 
 
 def test_the_command_says_what_is_missing(holed, tmp_path, capsys):

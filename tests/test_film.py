@@ -15,28 +15,26 @@ from conftest import empty, small_scene
 from PIL import Image
 from test_mirror import channel
 
-from mpmopt import film as films
-from mpmopt import runfile
 from mpmopt.__main__ import main
+from mpmopt.assess.trajectory import Motion, equal_steps, optimised, post_processed, reference
+from mpmopt.design.problem import Problem
 from mpmopt.errors import (
     DesignError,
     MissingLibraryError,
-    RunFileError,
     SimulationError,
     StorageError,
 )
-from mpmopt.files import refuse_foreign
-from mpmopt.film import LAST, RATE, Screen, _mp4, film, playing_time
-from mpmopt.interrupt import Interrupted
-from mpmopt.motion import Motion, equal_steps, optimised, post_processed, reference
-from mpmopt.problem import Problem
+from mpmopt.io.console import Interrupted
+from mpmopt.results import runfile
 from mpmopt.scene import Grid, Solid
+from mpmopt.view import film as films
+from mpmopt.view.film import LAST, RATE, Screen, _mp4, film, playing_time
 
 ROOT = Path(__file__).parent.parent
 
 
 def motions(run, count):
-    problem, x = run.problem(), run.best
+    problem, x = run.problem(), run.result.x
     return [
         Motion.of(body(problem, x), equal_steps(problem.scene, count))
         for body in (optimised, post_processed, reference)
@@ -75,7 +73,7 @@ def test_bodies_are_where_their_particles_are_and_move(short_run):
     pictures = [screen.frame(number) for number in range(5)]
     height = len(pictures[0])
     for panel, motion in zip(screen.panels, shown):
-        problem, x = short_run.problem(), short_run.best
+        problem, x = short_run.problem(), short_run.result.x
         body = {"o": optimised, "p": post_processed, "f": reference}[motion.name[0]](problem, x)
         solid = (body.gamma >= 0.9) & (body.simulation.particles.actuator < 0)
         assert solid.sum() >= 4
@@ -102,6 +100,7 @@ def test_both_halves_of_a_symmetric_scene_are_shown():
     screen = Screen([motion], 1.0)
     (panel,) = screen.panels
     picture = screen.frame(1)[..., 0].astype(int)
+    assert scene.mirror is not None
     axis = panel.transData.transform((0.0, scene.mirror.position))[1]
     box = panel.get_window_extent()
     above = [round(axis + 0.5 + k) for k in range(int(box.height / 2) - 3)]
@@ -138,10 +137,11 @@ def mp4(path):
     )  # fmt: skip
     facts = decoded.stderr.decode()
     assert "Video: h264" in facts and f"{RATE} fps" in facts
-    width, height = map(int, re.search(r", (\d+)x(\d+)[ ,]", facts).groups())
+    width, height = map(int, re.findall(r", (\d+)x(\d+)[ ,]", facts)[0])
     return np.frombuffer(decoded.stdout, np.uint8).reshape(-1, height, width, 3).astype(int)
 
 
+@pytest.mark.process
 def test_mp4_has_the_frames_of_the_gif(short_run, tmp_path):
     told = film(tmp_path / "film.mp4", short_run, seconds=0.4)
     frames = mp4(tmp_path / "film.mp4")
@@ -153,6 +153,7 @@ def test_mp4_has_the_frames_of_the_gif(short_run, tmp_path):
         assert np.abs(frames[number, :height, :width] - wanted).mean() <= 4.0
 
 
+@pytest.mark.process
 @pytest.mark.parametrize(("height", "width"), [(33, 47), (33, 48), (34, 47), (34, 48)])
 def test_mp4_can_have_any_size(tmp_path, height, width):
     """Matplotlib rounds sizes of figures in one way or another; H.264 needs even ones."""
@@ -183,13 +184,6 @@ def test_times_and_lengths_of_a_small_and_fast_robot_can_be_read():
     assert shown == [("0.0000", "0.00635"), ("0.0030", "0.00648"), ("0.0100", "0.00741")]
 
 
-def test_a_long_film_is_known_as_ours(tmp_path):
-    grey = np.zeros((16, 16, 3), np.uint8)
-    file = tmp_path / "film.mp4"
-    file.write_bytes(_mp4(grey for _ in range(2000)))
-    refuse_foreign([file])
-
-
 def test_mp4_without_its_library_says_what_to_install(short_run, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     with pytest.raises(MissingLibraryError, match=r"pip install 'mpmopt\[film\]'"):
@@ -197,9 +191,13 @@ def test_mp4_without_its_library_says_what_to_install(short_run, tmp_path, monke
     assert not list(tmp_path.iterdir())
 
 
-def test_an_encoder_that_fails_leaves_nothing(short_run, tmp_path, monkeypatch):
-    monkeypatch.setattr(films, "_ffmpeg", lambda: "false")
-    with pytest.raises(StorageError, match="ffmpeg ended with 1"):
+@pytest.mark.process
+@pytest.mark.parametrize("name", ["false", "true", "no-such-program"])
+@pytest.mark.filterwarnings("ignore::ResourceWarning")  # the library leaves its pipe open then
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_an_encoder_that_fails_leaves_nothing(short_run, tmp_path, monkeypatch, name):
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", name)
+    with pytest.raises(StorageError, match="ffmpeg"):
         film(tmp_path / "film.mp4", short_run, seconds=0.4)
     assert not list(tmp_path.iterdir())
 
@@ -256,6 +254,7 @@ def test_a_full_disk_leaves_an_older_film_as_it_was(short_run, tmp_path):
     assert target.read_text() == "an older film"
 
 
+@pytest.mark.process
 @pytest.mark.parametrize("ending", ["gif", "mp4"])
 def test_an_interrupt_leaves_an_older_film_as_it_was(short_path, tmp_path, monkeypatch, ending):
     target = tmp_path / f"film.{ending}"
@@ -287,8 +286,8 @@ def test_the_command_says_what_it_made(short_path, tmp_path, capsys):
 def test_a_run_without_a_design_has_no_film(tmp_path):
     scene = small_scene()
     runfile.write(tmp_path / "run.h5", empty(scene))
-    with pytest.raises(RunFileError, match="no evaluation succeeded yet"):
-        film(tmp_path / "film.gif", runfile.read(tmp_path / "run.h5"))
+    with pytest.raises(DesignError, match="no evaluation succeeded yet"):
+        film(tmp_path / "film.gif", runfile.read_run(tmp_path / "run.h5").run)
     assert main(["film", str(tmp_path / "run.h5")]) == 1
     assert [file.name for file in tmp_path.iterdir()] == ["run.h5"]
 
@@ -300,6 +299,7 @@ def test_an_interrupt_ends_a_long_film_at_once(short_path, tmp_path):
          "--out", tmp_path / "film.gif"],
         stderr=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": str(ROOT)},
     )  # fmt: skip
+    assert process.stderr is not None
     assert "of 1500 frames" in process.stderr.readline()
     process.send_signal(signal.SIGINT)
     _, said = process.communicate(timeout=30)

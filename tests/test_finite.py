@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 from conftest import small_scene
 
+from mpmopt.design.objective import Objective
+from mpmopt.design.problem import Evaluation, Problem
 from mpmopt.errors import DesignError
-from mpmopt.mma import MMAError, MovingAsymptotes
-from mpmopt.objective import Objective
-from mpmopt.optimize import Settings, Stage, optimise
-from mpmopt.problem import Evaluation, Problem
-from mpmopt.simulate import Margins
+from mpmopt.optimisation.loop import optimise
+from mpmopt.optimisation.mma import MMAError, MovingAsymptotes
+from mpmopt.optimisation.settings import Settings, Stage
+from mpmopt.simulation.indicators import Indicators
 
 SETTINGS = Settings(
     (Stage(1.0, 1e-2, 1e-3, 4e-3),), window=2, least_iterations=4, most_iterations=4
@@ -51,7 +52,7 @@ def steps(monkeypatch):
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-@pytest.mark.parametrize("method", ["value", "seed"])
+@pytest.mark.parametrize("method", ["value", "centroid_adjoint"])
 def test_an_evaluation_that_is_not_finite_is_a_failed_one(spoil, steps, method, value):
     scene = small_scene(steps=20)
     # Each evaluation is tried with three steps, the third of them all in vain.
@@ -70,7 +71,7 @@ def test_an_evaluation_that_is_not_finite_is_a_failed_one(spoil, steps, method, 
 
 def test_if_none_is_finite_there_is_no_result(spoil, steps):
     scene = small_scene(steps=20)
-    spoil(Objective, "seed", range(100), np.nan)
+    spoil(Objective, "centroid_adjoint", range(100), np.nan)
     run = optimise(scene, SETTINGS, Problem(scene).join(*START))
     assert steps == []
     assert "gave up" in run.stop_reason
@@ -82,7 +83,7 @@ def test_if_none_is_finite_there_is_no_result(spoil, steps):
 def test_moving_asymptotes_refuse_what_a_wrong_problem_gives(monkeypatch, value, entry):
     # Problem never returns this; if it did, the run would end, not go astray.
     def evaluate(self, x):
-        return Evaluation(value, np.full(x.size, entry), Margins(), self.scene.time_step)
+        return Evaluation(value, np.full(x.size, entry), Indicators(), self.scene.time_step)
 
     monkeypatch.setattr(Problem, "evaluate", evaluate)
     scene = small_scene(steps=20)

@@ -2,34 +2,38 @@
 
 import dataclasses
 import doctest
+from typing import Any
 
 import numpy as np
 import pytest
 from conftest import SHORT, small_scene
 
-from mpmopt import runfile
-from mpmopt.audit import audit
-from mpmopt.binary import full_block
-from mpmopt.case import Case, ProgressBar, drawn, resume, run, sharpened, summarise
-from mpmopt.checkpoints import Checkpointing
+from mpmopt.app.case import Case, ProgressBar, drawn, resume, run
+from mpmopt.app.multistart import multistart
+from mpmopt.app.summary import summarise
+from mpmopt.assess.refinement import audit
+from mpmopt.assess.threshold import solid_reference
+from mpmopt.design.problem import Problem
 from mpmopt.errors import DesignError, SceneError, SweepError
-from mpmopt.multistart import multistart
-from mpmopt.optimize import Settings, Stage, begin, go_on, optimise, refuse_unfit
-from mpmopt.problem import Problem
+from mpmopt.optimisation.loop import begin, check_body_fits, go_on, optimise
+from mpmopt.optimisation.presets import continuation
+from mpmopt.optimisation.settings import Settings, Stage
+from mpmopt.results import runfile
 from mpmopt.scene import Actuator, Design, Mirror, Scene, Solid
+from mpmopt.simulation.checkpoints import Checkpointing
 
 C = 1 / 16
 SCENE = small_scene(steps=4)
 PROBLEM = Problem(SCENE)
 START = PROBLEM.join(0.0, 1.0, -0.3, -0.5)
 STAGE = SHORT.stages[0]
-CASE = Case(SCENE, SHORT, full_block)
+CASE = Case(SCENE, SHORT, solid_reference)
 
 
 def test_one_stage_one_list_of_numbers_and_one_callback_are_enough():
     settings = dataclasses.replace(SHORT, stages=STAGE)
     assert settings == SHORT == dataclasses.replace(SHORT, stages=iter([STAGE]))
-    calls = []
+    calls: list[Any] = []
     for start in (list(START), tuple(START), (x for x in [START])):
         optimise(SCENE, settings, start, calls.append)
         assert np.array_equal(calls[-1].first.x, START)
@@ -39,7 +43,7 @@ def test_one_stage_one_list_of_numbers_and_one_callback_are_enough():
 def test_few_iterations_need_no_word_about_the_least():
     few = Settings(STAGE, most_iterations=10)
     assert (few.least, Settings(STAGE).least) == (10, 20)
-    assert dataclasses.replace(sharpened(8e-4), most_iterations=5).least == 5
+    assert dataclasses.replace(continuation(8e-4), most_iterations=5).least == 5
     assert Settings.from_dict(dataclasses.asdict(few)) == few
     with pytest.raises(DesignError, match="least_iterations = 11 is above most_iterations = 10"):
         dataclasses.replace(few, least_iterations=11)
@@ -53,10 +57,13 @@ def test_few_iterations_need_no_word_about_the_least():
         (lambda: Settings(5), "stages = 5 must be Stages"),
         (lambda: Settings(Stage), "must be Stages"),
         (lambda: Settings(STAGE, tolerance=np.nan), "tolerance = nan must be finite"),
-        (lambda: Stage(1.0, 2.0, 1e-3, 1e-3), "mass_floor = 2.0 must be at most 1"),
-        (lambda: Stage(1.0, 1e-3, 2.0, 1e-3), "stiffness_floor = 2.0 must be at most 1"),
+        (lambda: Stage(1.0, 2.0, 1e-3, 1e-3), "void_density = 2.0 must be at most 1"),
+        (lambda: Stage(1.0, 1e-3, 2.0, 1e-3), "void_stiffness = 2.0 must be at most 1"),
         (lambda: optimise(Scene, SHORT, START), "scene = .* class Scene"),
-        (lambda: optimise(SCENE, sharpened, START), "settings = .*sharpened.* such as sharpened"),
+        (
+            lambda: optimise(SCENE, continuation, START),
+            "settings = .*continuation.* such as continuation",
+        ),
         (lambda: optimise(SCENE, (STAGE,), START), "settings = .* write Settings"),
         (lambda: optimise(SCENE, SHORT, None), "x holds object"),
         (lambda: optimise(SCENE, SHORT, 0.3), "x has shape .*Problem.join"),
@@ -72,7 +79,7 @@ def test_few_iterations_need_no_word_about_the_least():
         (lambda: PROBLEM.transfer(SCENE, START), "class Problem"),
         (lambda: audit(SCENE, START), "class Problem"),
         (lambda: summarise(CASE, {}), "class Optimisation"),
-        (lambda: dataclasses.replace(CASE, settings=sharpened), "such as sharpened"),
+        (lambda: dataclasses.replace(CASE, settings=continuation), "such as continuation"),
         (lambda: dataclasses.replace(CASE, scene=Scene), "class Scene"),
         (lambda: dataclasses.replace(CASE, drawing=np.ones(32, bool)), "function of positions"),
         (lambda: dataclasses.replace(CASE, start=START), "class Mapping"),
@@ -93,7 +100,7 @@ def test_what_is_of_another_kind_is_named(call, says):
         (lambda out: run(dataclasses.replace(CASE, start={"theta": "a"}), out), "theta holds"),
         (lambda out: run(dataclasses.replace(CASE, start={"theta": np.nan}), out), "nan"),
         (lambda out: resume(None), "path = None must be a path"),
-        (lambda out: runfile.read(None), "path = None must be a path"),
+        (lambda out: runfile.read_run(None), "path = None must be a path"),
         (lambda out: runfile.write(out / "run.h5", CASE), "class Optimisation"),
         (lambda out: runfile.write(5, begin(SCENE, SHORT, START)), "path = 5 must be a path"),
         (lambda out: multistart(CASE, out, 1.5), "starts = 1.5 must be a whole number"),
@@ -108,12 +115,12 @@ def test_what_is_of_another_kind_is_named_before_anything_is_written(tmp_path, c
 
 
 def test_texts_are_paths_too(tmp_path, monkeypatch):
-    monkeypatch.setattr("mpmopt.case._draw", lambda *_: None)
+    monkeypatch.setattr("mpmopt.app.case._draw", lambda *_: None)
     summary = run(CASE, str(tmp_path / "out"))
     path = str(tmp_path / "out" / "run.h5")
     assert resume(path) == summary
-    runfile.write(path, runfile.read(path).run)
-    assert runfile.read(path).summary == {}
+    runfile.write(path, runfile.read_run(path).run)
+    assert runfile.read_run(path).summary == {}
 
 
 @pytest.mark.parametrize(
@@ -189,7 +196,7 @@ def test_a_body_that_makes_no_robot_can_be_simulated_but_not_optimised(tmp_path,
     problem = Problem(scene)
     x = problem.join(0.0, 0.0, 0.0, 0.0)
     assert np.isfinite(problem.value(x))
-    case = Case(scene, SHORT, full_block)
+    case = Case(scene, SHORT, solid_reference)
     for call in (
         lambda: optimise(scene, SHORT, x),
         lambda: run(case, tmp_path),
@@ -209,14 +216,14 @@ def test_a_body_that_hangs_together_through_others_is_optimised():
         Design((4 * C, 4 * C), (6 * C, 4.5 * C)),
         mirror=None,
     )
-    refuse_unfit(around)
+    check_body_fits(around)
     halves = pieces(
         Design((3 * C, 6 * C), (5 * C, 7 * C)),
         Actuator((3 * C, 7 * C), (5 * C, 9 * C)),
         Design((3 * C, 9 * C), (5 * C, 10 * C)),
         mirror=Mirror("y", 8 * C),
     )
-    refuse_unfit(halves)
+    check_body_fits(halves)
 
 
 def test_a_picture_as_phi_is_told_where_its_entries_are():

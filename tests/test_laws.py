@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from exact import at_rest, manufactured_error, solid_simulation
 
-from mpmopt.particles import Particles, lay_out
 from mpmopt.scene import Grid, Material, Scene, Solid, Wall
+from mpmopt.scene.particles import Particles, discretise
 
 
 def energy(scene, m, V, state):
@@ -31,7 +31,7 @@ def test_spinning_disc_keeps_momentum_and_angular_momentum():
         Grid((n, n), dx), time_step=2e-4, steps=5000,
         body=(Solid((0.25, 0.25), (0.75, 0.75)),),
     )  # fmt: skip
-    everything = lay_out(scene)
+    everything = discretise(scene)
     arm = everything.position - 0.5
     disc = everything.subset(np.hypot(*arm.T) < radius)
     state = at_rest(disc)
@@ -76,7 +76,7 @@ def test_self_weight_column_carries_what_lies_above():
         body=(Solid((0.25, 0.125), (0.375, 0.125 + length)),),
         walls=(Wall("y", 0.125, friction=0.0),),
     )  # fmt: skip
-    particles = lay_out(scene)
+    particles = discretise(scene)
     end = solid_simulation(scene, particles).run()
     height = particles.position[:, 1] - 0.125
     excess = -mu * (end[11] ** 2 - 1.0) / end[11] - g * (length - height)
@@ -118,7 +118,7 @@ def test_a_sliding_block_loses_friction_times_the_normal_impulse(friction):
         body=(Solid((8 * dx, 3 * dx), (16 * dx, 7 * dx)),),
         walls=(Wall("y", 3 * dx, friction=friction),),
     )  # fmt: skip
-    particles = lay_out(scene)
+    particles = discretise(scene)
     state = at_rest(particles)
     state[2] = 1.0
     end = solid_simulation(scene, particles, state).run()
@@ -141,7 +141,7 @@ def test_particles_of_another_order_give_the_same_motion(rng):
         Grid((32, 32), 1 / 32), time_step=2e-3, steps=100, gravity=(0.0, -10.0),
         body=(Solid((0.25, 0.125), (0.5, 0.25)),), walls=(Wall("y", 0.125),),
     )  # fmt: skip
-    particles = lay_out(scene)
+    particles = discretise(scene)
     order = rng.permutation(len(particles.position))
     shuffled = Particles(*(np.ascontiguousarray(a[order]) for a in vars(particles).values()))
     one = solid_simulation(scene, particles).run()

@@ -1,25 +1,26 @@
 """A plane of symmetry: half of the body is the same solution."""
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
 from conftest import small_scene, worst
 from crawler import crawler
 
+from mpmopt.assess.trajectory import with_image
+from mpmopt.assess.verify import COMPLEX_TOLERANCE, complex_step_test, kernel_mismatches
+from mpmopt.design.problem import Problem
 from mpmopt.errors import SceneError
-from mpmopt.motion import with_image
-from mpmopt.particles import lay_out, mirror_images
-from mpmopt.problem import Problem
 from mpmopt.scene import Actuator, Design, Mirror, Scene, Solid, Wall
-from mpmopt.verify import COMPLEX_TOLERANCE, complex_step_test, kernel_mismatches
+from mpmopt.scene.particles import discretise, mirror_images
 
 C = 1 / 16
 
 
 def channel(axis="y", **changes) -> Scene:
     """A symmetric body that fills a channel along the other axis, and is squeezed in its middle."""
-    boxes = [
+    boxes: list[Any] = [
         (Design, (4, 5), (6, 11)),
         (Actuator, (6, 7), (8, 9)),
         (Solid, (6, 5), (8, 7)),
@@ -50,7 +51,7 @@ def both(half, steps):
 @pytest.mark.parametrize(
     ("scene", "steps"),
     [
-        (crawler(64, 8e-4).vary(mass_floor=1e-2), 600),
+        (crawler(64, 8e-4).vary(void_density=1e-2), 600),
         (channel("y", time_step=2e-3), 500),
         (channel("x", time_step=2e-3), 500),
     ],
@@ -126,6 +127,6 @@ def test_what_is_not_symmetric_is_refused(changes, says):
 
 def test_only_the_half_is_laid_out():
     scene = channel("y")
-    half, whole = lay_out(scene), lay_out(scene, whole=True)
+    half, whole = discretise(scene), discretise(scene, whole=True)
     assert half.position[:, 1].max() < 0.5
     assert 2 * half.volume.sum() == pytest.approx(whole.volume.sum())

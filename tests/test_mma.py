@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,8 +12,9 @@ from scipy import sparse
 from scipy.optimize import Bounds, LinearConstraint, NonlinearConstraint, basinhopping
 from scipy.optimize import minimize as scipy_minimize
 
-from mpmopt import mma
-from mpmopt.mma import MMAError, MovingAsymptotes
+from mpmopt.optimisation import mma
+from mpmopt.optimisation.minimize import minimize
+from mpmopt.optimisation.mma import MMAError, MovingAsymptotes
 
 pytestmark = pytest.mark.filterwarnings("error")
 VARIANTS = pytest.mark.parametrize("globally_convergent", [False, True])
@@ -56,7 +58,7 @@ def three_bar_truss(z):
     x, t = z[:3], z[3]
     r = np.array([[1, 0], [np.sqrt(0.5), np.sqrt(0.5)], [0, 1]])
     stiffness = (r.T * x) @ r
-    g, dgdx = [x.sum() - 3], [[1.0, 1.0, 1.0, 0.0]]
+    g, dgdx = [x.sum() - 3], [np.array([1.0, 1.0, 1.0, 0.0])]
     for load in np.array([[1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]):
         u = np.linalg.solve(stiffness, load)
         g.append(load @ u - t)
@@ -84,7 +86,7 @@ def run(problem, x, lower, upper, globally_convergent=False, **options):
         "fun": lambda x: -np.array(problem(x)[2]),
         "jac": lambda x: -np.array(problem(x)[3]),
     }
-    return mma.minimize(
+    return minimize(
         lambda x: problem(x)[:2],
         x,
         jac=True,
@@ -360,7 +362,7 @@ def test_thousands_of_variables_with_a_volume_constraint(globally_convergent):
 
 def test_globally_convergent_variant_descends_monotonically():
     values = []
-    result = mma.minimize(
+    result = minimize(
         rosenbrock,
         [-1.2, 1.0],
         jac=True,
@@ -374,7 +376,7 @@ def test_globally_convergent_variant_descends_monotonically():
     assert values[-1] < 0.01 * rosenbrock([-1.2, 1.0])[0]
     # The ordinary variant does not have this property, so that the test can fail.
     values.clear()
-    mma.minimize(
+    minimize(
         rosenbrock,
         [-1.2, 1.0],
         jac=True,
@@ -447,7 +449,7 @@ def test_fixed_variables_stay(globally_convergent):
 
 def test_fixed_variable_in_a_constraint_without_jacobian():
     """min x + y + z with x y z >= 2 and z = 1: finite differences have no room in z."""
-    result = mma.minimize(
+    result = minimize(
         lambda x: (x.sum(), np.ones(3)),
         [1.0, 2.5, 1.0],
         jac=True,
@@ -570,7 +572,7 @@ def test_method_of_scipy_minimize_takes_every_form_of_constraint(form):
         jac=True,
         bounds=Bounds(0.1, 5.0),
         constraints=TWO_SIDED[form],
-        method=mma.minimize,
+        method=minimize,
         tol=1e-7,
         options={"maxiter": 60},
     )
@@ -592,7 +594,7 @@ def test_linear_constraint_with_args_and_separate_gradient():
             LinearConstraint([[1, 1]], 1, 2),
             LinearConstraint([1, -1], ub=0.5),
         ],
-        method=mma.minimize,
+        method=minimize,
         options={"tol": 1e-10, "globally_convergent": True},
     )
     assert result.success
@@ -614,7 +616,7 @@ def test_callback_sees_every_iterate_and_can_stop():
         [-1.2, 1.0],
         jac=True,
         bounds=[(-2, 2)] * 2,
-        method=mma.minimize,
+        method=minimize,
         callback=callback,
     )
     assert len(seen) == result.nit == 4 and result.status == 3 and not result.success
@@ -623,7 +625,7 @@ def test_callback_sees_every_iterate_and_can_stop():
 
 def test_wrong_gradient_is_not_taken_for_convergence():
     """With the sign of the gradient reversed no step can be conservative."""
-    result = mma.minimize(
+    result = minimize(
         lambda x: (float(x @ x), -2 * x),
         [0.5, 0.25],
         jac=True,
@@ -653,7 +655,7 @@ def test_wrong_gradient_is_not_taken_for_convergence():
 def test_minimize_refuses_what_it_cannot_do(arguments, message):
     good = {"x0": [0.5, 0.5], "jac": True, "bounds": [(0, 1)] * 2}
     with pytest.raises(MMAError, match=message):
-        scipy_minimize(lambda x: (x @ x, 2 * x), method=mma.minimize, **{**good, **arguments})
+        scipy_minimize(lambda x: (x @ x, 2 * x), method=minimize, **{**good, **arguments})
 
 
 def sphere(x):
@@ -663,7 +665,7 @@ def sphere(x):
 @VARIANTS
 def test_success_is_feasible_where_the_constraint_was_steep_once(globally_convergent):
     """min x with exp(20 x) >= exp(-6) is at -0.3: the gradient falls by 1e10 on the way."""
-    result = mma.minimize(
+    result = minimize(
         lambda x: (x[0], [1.0]),
         [0.9],
         jac=True,
@@ -685,7 +687,7 @@ def test_success_is_a_minimum_where_the_objective_was_steep_once(k, globally_con
     """exp(k x) on [-1, 1] from 0.9 has its minimum at -1, whatever the first gradient was."""
     x, done = [0.9], False
     for _ in range(8):  # a search that did not succeed says how to go on
-        result = mma.minimize(
+        result = minimize(
             lambda x: (np.exp(k * x[0]), k * np.exp(k * x)),
             x,
             jac=True,
@@ -701,7 +703,7 @@ def test_success_is_a_minimum_where_the_objective_was_steep_once(k, globally_con
 
 def test_flat_minimum_counts_as_one():
     """At that of x^4 the curvature vanishes with the gradient."""
-    result = mma.minimize(
+    result = minimize(
         lambda x: (np.sum(x**4), 4 * x**3), [0.7, -0.6], jac=True, bounds=[(-1, 1)] * 2
     )
     assert result.success
@@ -736,7 +738,7 @@ def test_success_means_feasible_in_units_of_the_gradient_at_the_end(
         slope = -scale * np.abs(k) * np.exp(k * (x[0] + a * x[1]))
         return np.stack([slope, a * slope], axis=1)
 
-    result = mma.minimize(
+    result = minimize(
         lambda x: (np.dot(weights, x) + 0.1 * float(x @ x), weights + 0.2 * x),
         start,
         jac=True,
@@ -754,7 +756,7 @@ def test_success_means_feasible_in_units_of_the_gradient_at_the_end(
 
 
 def test_constraint_that_cannot_be_met_is_named_in_the_units_of_the_user():
-    result = mma.minimize(
+    result = minimize(
         lambda x: (x.sum(), np.ones(10)),
         np.ones(10),
         jac=True,
@@ -767,7 +769,7 @@ def test_constraint_that_cannot_be_met_is_named_in_the_units_of_the_user():
     assert result.status == 2 and not result.success
     assert "constraints[1][1] violates its lower limit 500 by 155:" in result.message
     assert result.maxcv == pytest.approx(155)  # 500 - 30 - 9 * 35
-    upper = mma.minimize(
+    upper = minimize(
         sphere,
         [0.5, 0.5],
         jac=True,
@@ -784,7 +786,7 @@ def test_constraint_that_cannot_be_met_is_named_in_the_units_of_the_user():
 
 @pytest.mark.parametrize("value", [1e-9, 1e-300])
 def test_violated_constraint_without_gradient_is_never_success(value):
-    result = mma.minimize(
+    result = minimize(
         sphere,
         [0.5, 0.5],
         jac=True,
@@ -798,7 +800,7 @@ def test_violated_constraint_without_gradient_is_never_success(value):
 
 def test_rounding_of_fixed_variables_is_no_violation():
     """0.1 + 0.2 <= 0.3 fails by one rounding, and nothing can be done about it."""
-    result = mma.minimize(
+    result = minimize(
         lambda x: (x[2], [0.0, 0.0, 1.0]),
         [0.1, 0.2, 0.5],
         jac=True,
@@ -815,7 +817,7 @@ def solved(**changes):
         "x0": [0.5, 0.5],
         "jac": True,
         "bounds": [(0, 1), (0, 3)],
-        "method": mma.minimize,
+        "method": minimize,
     }
     return scipy_minimize(**{**arguments, **changes})
 
@@ -826,7 +828,7 @@ def gradient_of_solved(x):
 
 def of_buffer(function):
     """The function with its values in one array, as codes in C and Fortran return them."""
-    buffer = {}
+    buffer: dict[str, np.ndarray] = {}
 
     def filled(x):
         value = np.asarray(function(x), dtype=float)
@@ -865,7 +867,7 @@ def test_memory_of_the_caller_is_neither_kept_nor_trusted(
     value = wrap(lambda x: [np.sum((x - 2) ** 2)])
     gradient = wrap(gradient_of_solved)
     both = {"fun": lambda x: (value(x.copy()), gradient(x)), "jac": True}
-    result = mma.minimize(
+    result = minimize(
         **(both if with_gradient else {"fun": value, "jac": gradient}),
         x0=[0.5, 0.5],
         bounds=[(0, 1), (0, 3)],
@@ -901,20 +903,25 @@ def test_callback_that_changes_what_it_is_given_changes_nothing(by_name):
 
 
 def test_callback_without_a_signature_is_given_x():
-    seen = []
+    seen: list[np.ndarray] = []
     assert solved(callback=seen.append).nit == len(seen)
 
 
 def test_start_outside_its_bounds_by_rounding_is_moved_to_them():
     low, high = 0.1, 0.1 + 0.2
     for x0 in (np.nextafter(low, 0), np.nextafter(high, 1)):
-        seen = []
-        result = mma.minimize(
-            lambda x: seen.append(x[0]) or (float(x @ x), 2 * x),  # noqa: B023
+        seen: list[float] = []
+
+        def noted(x, seen=seen):
+            seen.append(x[0])
+            return x
+
+        result = minimize(
+            lambda x: (float(noted(x) @ x), 2 * x),
             [x0],
             jac=True,
             bounds=[(low, high)],
-            constraints=NonlinearConstraint(lambda x: seen.append(x[0]) or x, -1, 1),  # noqa: B023
+            constraints=NonlinearConstraint(noted, -1, 1),
         )
         assert result.success and min(seen) >= low and max(seen) <= high
     assert solved(x0=[-1e-17, 0.5]).success
@@ -931,7 +938,7 @@ def test_basinhopping_takes_it_for_its_searches():
         [1.0],
         niter=8,
         take_step=lambda x: low + (high - low) * rng.random(1),
-        minimizer_kwargs={"method": mma.minimize, "jac": True, "bounds": Bounds(low, high)},
+        minimizer_kwargs={"method": minimize, "jac": True, "bounds": Bounds(low, high)},
     )
     assert result.lowest_optimization_result.success
     best = min(np.roots([4, 0, -4, 0.3]).real)  # Newton's own polynomial: 4 x^3 - 4 x + 0.3 = 0
@@ -997,7 +1004,7 @@ def test_forms_that_scipy_takes_are_taken(form, direct):
     if direct:
         arguments |= arguments.pop("options", {})
         start = {"fun": lambda x: (np.sum((x - 2) ** 2), 2 * (x - 2)), "x0": [0.5, 0.5]}
-        result = mma.minimize(**{**start, "jac": True, **arguments})
+        result = minimize(**{**start, "jac": True, **arguments})
     else:
         result = solved(**arguments)
     assert result.success, result.message
@@ -1012,7 +1019,7 @@ def test_finite_differences_leave_fixed_variables_where_they_are():
         seen.append(x.copy())
         return x[0] + np.sqrt(x[1])
 
-    result = mma.minimize(
+    result = minimize(
         lambda x: (float((x[0] - 2) ** 2), [2 * (x[0] - 2), 0.0]),
         [0.5, 0.0],
         jac=True,
@@ -1174,17 +1181,18 @@ def test_nothing_is_dropped_or_misread_in_silence(arguments, message):
 def test_direct_call_is_as_strict(arguments, message):
     good = {"fun": sphere, "x0": [0.5, 0.5], "jac": True, "bounds": [(0, 1)] * 2}
     with pytest.raises(MMAError, match=message):
-        mma.minimize(**{**good, **arguments})
+        minimize(**{**good, **arguments})
 
 
 def test_gradient_of_one_variable_may_be_a_number():
-    result = mma.minimize(
+    result = minimize(
         lambda x: (x[0] - 2) ** 2, [0.5], jac=lambda x: 2 * (x[0] - 2), bounds=[(0, 1)]
     )
     assert result.success and result.x[0] == 1
 
 
 def test_evaluate_must_return_a_pair_of_real_numbers():
+    value: Any
     for value, message in ((1.0, "evaluate gave 1.0"), ((1.0, [1j]), "g is .*real numbers")):
         with pytest.raises(MMAError, match=message):
             MovingAsymptotes([0.0, 0.0], [1.0, 1.0]).step(

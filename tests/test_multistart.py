@@ -10,22 +10,25 @@ import shutil
 import signal
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
+from typing import Any
 
 import climber
 import numpy as np
 import pytest
 from walker import slanted_legs, walker
 
-from mpmopt import multistart, runfile
-from mpmopt.audit import audit
-from mpmopt.case import Case, main, run
+from mpmopt.app import multistart
+from mpmopt.app.case import Case, run
+from mpmopt.app.multistart import AMPLITUDE, LENGTH, best_of, random_start, report
+from mpmopt.app.script import main
+from mpmopt.app.sweeps import sweep
+from mpmopt.assess.refinement import audit
+from mpmopt.design.problem import Problem
 from mpmopt.errors import StorageError, SweepError
-from mpmopt.files import locked
-from mpmopt.interrupt import Interrupted
-from mpmopt.multistart import AMPLITUDE, LENGTH, best_of, random_start, report
-from mpmopt.optimize import Settings, Stage
-from mpmopt.problem import Problem
-from mpmopt.sweeps import sweep
+from mpmopt.io.console import Interrupted
+from mpmopt.io.files import locked
+from mpmopt.optimisation.settings import Settings, Stage
+from mpmopt.results import runfile
 
 SCENE = walker(64, 8e-4)
 SIDE = 20 / 64  # the longest of the walker's design domain
@@ -66,7 +69,7 @@ def test_every_grid_begins_with_the_same_field():
 def row(start, gain, audited):
     return {
         "start": start, "post_processed": 0.2 + gain, "gain": gain, "kept_half_step": 1.0,
-        "kept_half_cells": audited / gain, "audited_gain": audited, "loose_particles": 0,
+        "kept_half_cells": audited / gain, "audited_gain": audited, "disconnected_particles": 0,
         "failed_evaluations": 0, "seconds": 1.0,
     }  # fmt: skip
 
@@ -100,6 +103,7 @@ def here(monkeypatch):
         yield
 
 
+@pytest.mark.process
 def test_starts_leave_their_runs_and_are_run_once(tmp_path, capsys, caplog):
     def command(starts):
         assert main("A case.", {"default": TINY}, ["--out", str(tmp_path), *starts]) == 0
@@ -116,13 +120,13 @@ def test_starts_leave_their_runs_and_are_run_once(tmp_path, capsys, caplog):
     assert [line["start"] for line in rows] == ["0", "1"]
     for number, line in enumerate(rows):
         summary = json.loads((kept[number].parent / "summary.json").read_text())
-        assert runfile.read(kept[number]).summary == summary
+        assert runfile.read_run(kept[number]).summary == summary
         gain = summary["post_processed"] - summary["reference"]
         assert float(line["gain"]) == pytest.approx(gain, rel=1e-3)
-    last = runfile.read(kept[1])
+    last = runfile.read_run(kept[1]).run
     gains = {
         row.name: row.distance - max(row.reference, summary["reference"])
-        for row in audit(last.problem(), last.best)
+        for row in audit(last.problem(), last.result.x)
     }
     del gains["twice the step"]
     assert float(line["audited gain"]) == pytest.approx(min(gains.values()), rel=1e-3)
@@ -135,6 +139,7 @@ def test_starts_leave_their_runs_and_are_run_once(tmp_path, capsys, caplog):
     assert "start 1" not in caplog.text
 
 
+@pytest.mark.case
 def test_the_plain_start_is_that_of_the_case(tmp_path, here):
     case = Case(
         dataclasses.replace(climber.climber(64, 8e-4), steps=5), TINY.settings,
@@ -142,17 +147,18 @@ def test_the_plain_start_is_that_of_the_case(tmp_path, here):
     )  # fmt: skip
     run(case, tmp_path / "alone")
     multistart.multistart(case, tmp_path, 1)
-    alone, start = (
-        runfile.read(tmp_path / name / "run.h5").run.first.x for name in ("alone", "start-0")
-    )
+    firsts: list[Any] = [
+        runfile.read_run(tmp_path / name / "run.h5").run.first for name in ("alone", "start-0")
+    ]
+    alone, start = (first.x for first in firsts)
     assert np.array_equal(start, alone)
     assert {0.7, 0.2, -0.3} <= set(start)
 
 
 def test_a_loss_is_not_scaled(tmp_path, monkeypatch):
-    gain = {"as designed": -0.1, "half the step": -0.05, "twice the step": -9.0,
+    gain: dict[str, Any] = {"as designed": -0.1, "half the step": -0.05, "twice the step": -9.0,
             "cells half as wide": -0.2}  # fmt: skip
-    summary = collections.defaultdict(float, gain=gain, gain_kept=gain)
+    summary: Any = collections.defaultdict(float, gain=gain, gain_kept=gain)
     monkeypatch.setattr(multistart, "run", lambda *_, **__: summary)
 
     def audited():
@@ -166,6 +172,7 @@ def test_a_loss_is_not_scaled(tmp_path, monkeypatch):
     assert math.isnan(audited())
 
 
+@pytest.mark.case
 def test_force_begins_anew_once_however_often_a_start_is_tried(tmp_path, here, monkeypatch):
     multistart.multistart(TINY, tmp_path, 1)
     log = tmp_path / "start-0" / "log.txt"
@@ -188,13 +195,13 @@ def test_force_removes_nothing_that_it_cannot_replace(tmp_path):
     for file in files:
         with locked(file), pytest.raises(StorageError, match="another process is at work"):
             multistart.multistart(TINY, tmp_path, 2, force=True)
-    drawn = dataclasses.replace(TINY, drawing=lambda position: position[:, 0] > 0.0)
-    with pytest.raises(SweepError, match="cannot travel"):
-        multistart.multistart(drawn, tmp_path, 2, force=True)
+    pytest.importorskip("distributed")
+    with pytest.raises(SweepError, match="nonsense"):
+        multistart.multistart(TINY, tmp_path, 2, scheduler="nonsense://here:1", force=True)
     assert [file.read_text() for file in files] == 2 * ["somebody's work"]
 
 
-def test_foreign_tables_are_replaced_only_by_force(tmp_path):
+def test_tables_without_their_starts_are_replaced_only_by_force(tmp_path):
     table = tmp_path / "starts.csv"
     table.write_text("somebody's")
     with pytest.raises(StorageError, match=r"starts\.csv is there already.*--force"):

@@ -7,19 +7,20 @@ import pytest
 from conftest import small_scene, worst
 from test_mirror import both, channel
 
-from mpmopt import mpm
-from mpmopt.checkpoints import Checkpointing
-from mpmopt.particles import lay_out
-from mpmopt.plain import step
-from mpmopt.scene import Solid, Wall
-from mpmopt.simulate import Simulation, world_of
-from mpmopt.verify import (
+from mpmopt import kernels
+from mpmopt.assess.verify import (
     COMPLEX_STEP,
     COMPLEX_TOLERANCE,
     DOT_TOLERANCE,
     complex_step_test,
     kernel_mismatches,
 )
+from mpmopt.scene import Solid, Wall
+from mpmopt.scene.particles import discretise
+from mpmopt.simulation.checkpoints import Checkpointing
+from mpmopt.simulation.reference import step
+from mpmopt.simulation.simulation import Simulation
+from mpmopt.simulation.surroundings import world_of
 
 C = 1 / 16
 FRICTION = (0.0, 0.4, 1.5, "stick")
@@ -66,17 +67,17 @@ def check(walls, rng, samples, seen):
         for _ in range(samples):
             v, bar = rng.standard_normal((2, 2))
             expected = wall_law(walls, node, v, seen)
-            assert np.abs(np.subtract(mpm.wall(*node, *v, world), expected)).max() <= 1e-15
+            assert np.abs(np.subtract(kernels.wall(*node, *v, world), expected)).max() <= 1e-15
             columns = [
                 np.imag(wall_law(walls, node, v + 1j * COMPLEX_STEP * direction)) / COMPLEX_STEP
                 for direction in np.eye(2)
             ]
-            found = mpm.wall_adjoint(*node, *v, world, *bar)
+            found = kernels.wall_adjoint(*node, *v, world, *bar)
             assert np.abs(found - np.array(columns) @ bar).max() <= 1e-14
 
 
 def test_every_branch_of_a_wall_and_of_its_adjoint(rng):
-    seen = set()
+    seen: set[tuple[str, ...]] = set()
     for axis, side, friction in itertools.product("xy", ("below", "above"), FRICTION):
         check([at(axis, side, friction)], rng, 8, seen)
     branches = ("in front", "leaves", "sticks", "slides -1", "slides +1")
@@ -89,13 +90,13 @@ def test_without_friction_nothing_sticks_at_rest_either(axis):
     world = world_with(at(axis, "below", 0.0))
     rest = (-1.0 + 0.0j, 1j * COMPLEX_STEP)[:: 1 if axis == "x" else -1]
     along = (0.0, 1.0) if axis == "x" else (1.0, 0.0)
-    assert np.imag(mpm.wall(2, 2, *rest, world)) / COMPLEX_STEP == pytest.approx(along)
-    assert mpm.wall_adjoint(2, 2, *np.real(rest), world, 1.0, 1.0) == along
+    assert np.imag(kernels.wall(2, 2, *rest, world)) / COMPLEX_STEP == pytest.approx(along)
+    assert kernels.wall_adjoint(2, 2, *np.real(rest), world, 1.0, 1.0) == along
 
 
 @pytest.mark.parametrize("order", [1, -1])
 def test_two_walls_with_friction_meet_in_a_corner_one_after_the_other(rng, order):
-    seen = set()
+    seen: set[tuple[str, ...]] = set()
     for one, other in itertools.product(("below", "above"), repeat=2):
         for friction in itertools.product(FRICTION, repeat=2):
             walls = [at("x", one, friction[0]), at("y", other, friction[1])]
@@ -106,13 +107,13 @@ def test_two_walls_with_friction_meet_in_a_corner_one_after_the_other(rng, order
 def test_a_body_in_a_corner_with_friction_does_what_the_walls_say():
     # Each wall's friction counts, and that of the second one from what the first one leaves.
     walls = (at("x", "below", 0.5), at("y", "below", 0.25))
-    assert mpm.wall(2, 2, -2.0, -4.0, world_with(*walls)) == pytest.approx((0.0, 0.0))
-    assert mpm.wall(2, 2, -2.0, -3.0, world_with(*walls)) == pytest.approx((0.0, 0.0))
-    assert mpm.wall(2, 2, -2.0, 3.0, world_with(*walls)) == pytest.approx((0.0, 2.0))
-    assert mpm.wall(2, 2, 3.0, -4.0, world_with(*walls)) == pytest.approx((2.0, 0.0))
-    assert mpm.wall(2, 2, 3.0, -4.0, world_with(*walls[::-1])) == pytest.approx((2.0, 0.0))
+    assert kernels.wall(2, 2, -2.0, -4.0, world_with(*walls)) == pytest.approx((0.0, 0.0))
+    assert kernels.wall(2, 2, -2.0, -3.0, world_with(*walls)) == pytest.approx((0.0, 0.0))
+    assert kernels.wall(2, 2, -2.0, 3.0, world_with(*walls)) == pytest.approx((0.0, 2.0))
+    assert kernels.wall(2, 2, 3.0, -4.0, world_with(*walls)) == pytest.approx((2.0, 0.0))
+    assert kernels.wall(2, 2, 3.0, -4.0, world_with(*walls[::-1])) == pytest.approx((2.0, 0.0))
     lifts = (at("x", "above", 0.5), at("y", "below", 0.25))
-    assert mpm.wall(13, 2, 2.0, -4.0, world_with(*lifts)) == pytest.approx((0.0, 0.0))
+    assert kernels.wall(13, 2, 2.0, -4.0, world_with(*lifts)) == pytest.approx((0.0, 0.0))
 
 
 @pytest.mark.parametrize("blend_time", [0.0, 5e-3])
@@ -143,7 +144,7 @@ def barely_touching(seed, blend_time, change=0.0):
     """
     scene = small_scene(walls=(), steps=1, blend_time=blend_time)
     rng = np.random.default_rng(seed)
-    particles = lay_out(scene)
+    particles = discretise(scene)
     count = len(particles.position)
     state = np.zeros((12, count))
     off = 10.0 ** rng.uniform(-12.0, -6.0, (2, count)) * rng.choice([-1.0, 1.0], (2, count))
@@ -175,7 +176,7 @@ def test_nodes_with_next_to_no_mass_spoil_no_gradient(rng, blend_time):
         simulation = barely_touching(seed, blend_time)
         bar, direction = rng.standard_normal((2, *simulation.initial.shape))
         with simulation.checkpoints(Checkpointing()) as checkpoints:
-            gradient = simulation.forward(checkpoints).reverse(bar).state
+            gradient = simulation.forward(checkpoints).reverse({simulation.steps: bar}).state
         change = 1j * COMPLEX_STEP * direction
         moved = barely_touching(seed, blend_time, change).run().imag / COMPLEX_STEP
         terms = np.abs(gradient * direction).sum() + np.abs(bar * moved).sum()

@@ -8,15 +8,18 @@ import numpy as np
 import pytest
 from conftest import small_scene
 
-from mpmopt import mpm
-from mpmopt.actuation import signal
-from mpmopt.checkpoints import Checkpointing, Schedule
+from mpmopt import kernels
+from mpmopt.design.actuation import signal
+from mpmopt.design.objective import Objective
+from mpmopt.design.problem import Problem
 from mpmopt.errors import SimulationError
-from mpmopt.objective import Objective
-from mpmopt.particles import Particles, lay_out
-from mpmopt.problem import Problem
+from mpmopt.kernels import contact
 from mpmopt.scene import Wall
-from mpmopt.simulate import Margins, Simulation, Watched, world_of
+from mpmopt.scene.particles import Particles, discretise
+from mpmopt.simulation.checkpoints import Checkpointing, Schedule
+from mpmopt.simulation.indicators import Indicators, Watched
+from mpmopt.simulation.simulation import Simulation
+from mpmopt.simulation.surroundings import world_of
 
 
 def test_a_signal_is_that_of_the_start_of_each_step():
@@ -48,21 +51,24 @@ def three():
 
 def test_the_objective_is_the_centroid_of_what_is_not_designed_by_its_present_volume():
     particles, state = three()
-    objective = Objective.of(particles, (1.0, 0.0))
+    objective = Objective.of(small_scene(), particles, (1.0, 0.0))
     assert objective.start == (1.0 * 1.0 + 3.0 * 2.0) / 4.0
-    assert objective.value(state) == pytest.approx((1.0 * 2.0 + 6.0 * 4.0) / 7.0)
-    slanted = Objective.of(particles, (0.6, 0.8))
+    assert objective.centroid(state) == pytest.approx((1.0 * 2.0 + 6.0 * 4.0) / 7.0)
+    slanted = Objective.of(small_scene(), particles, (0.6, 0.8))
     along = (0.6 * 2.0 + 0.8 * 1.0, 0.6 * 4.0 + 0.8 * 3.0)
-    assert slanted.value(state) == pytest.approx((along[0] + 6.0 * along[1]) / 7.0)
+    assert slanted.centroid(state) == pytest.approx((along[0] + 6.0 * along[1]) / 7.0)
 
 
 def test_after_a_transient_the_objective_is_where_it_would_be_had_it_begun_at_the_start():
     particles, state = three()
-    objective = Objective.of(particles, (1.0, 0.0))
+    scene = small_scene(transient=3 * 4e-3)
+    objective = Objective.of(scene, particles, (1.0, 0.0))
+    assert objective.instants == (3,)
+    assert Objective.of(small_scene(), particles).instants == ()
     later = state.copy()
     later[0] += 0.5
-    assert objective.value(later, state) == pytest.approx(objective.start + 0.5)
-    assert objective.value(state, state) == pytest.approx(objective.start)
+    assert objective.value({3: state, 9: later}) == pytest.approx(objective.start + 0.5)
+    assert objective.value({3: state, 9: state}) == pytest.approx(objective.start)
 
 
 def test_the_kernels_know_the_walls_of_the_scene():
@@ -76,22 +82,23 @@ def test_the_kernels_know_the_walls_of_the_scene():
         blend_time=8e-3,
     )
     world = world_of(scene)
-    assert world.wall_axis.tolist() == [1, 0, 0]
-    assert world.wall_side.tolist() == [1, 1, -1]
-    assert world.wall_friction.tolist() == [0.25, math.inf, 0.0]
+    assert world.walls[:, contact.AXIS].tolist() == [1, 0, 0]
+    assert world.walls[:, contact.SIDE].tolist() == [1, 1, -1]
+    assert world.walls[:, contact.NODE].tolist() == [4, 3, 12]
+    assert world.walls[:, contact.FRICTION].tolist() == [0.25, math.inf, 0.0]
     assert world.keep == pytest.approx(math.exp(-0.5))
     assert world_of(dataclasses.replace(scene, blend_time=0.0)).keep == 0.0
 
 
 def test_margins_of_two_runs_are_the_worse_of_each():
-    one = Margins(0.1, 0.9, 0.5, 1.5, 0.0)
-    other = Margins(0.2, 0.8, 0.6, 1.25, 0.01)
-    assert one.join(other) == other.join(one) == Margins(0.2, 0.9, 0.5, 1.5, 0.01)
+    one = Indicators(0.1, 0.9, 0.5, 1.5, 0.0)
+    other = Indicators(0.2, 0.8, 0.6, 1.25, 0.01)
+    assert one.join(other) == other.join(one) == Indicators(0.2, 0.9, 0.5, 1.5, 0.01)
 
 
 def test_only_stretched_solid_can_be_torn():
     scene = small_scene()
-    particles = lay_out(scene)
+    particles = discretise(scene)
     count = len(particles.position)
     state = np.zeros((12, count))
     state[0:2] = particles.position.T
@@ -101,10 +108,12 @@ def test_only_stretched_solid_can_be_torn():
     mu[:2] *= 0.1, 0.49  # void and what is nearly void
     signal = np.zeros((scene.steps, 2))
     simulation = Simulation(scene, particles, np.ones(count), mu, mu, signal, state)
-    assert simulation.margins(mpm.grouped(state)).stretch == pytest.approx(2.0)
+    assert simulation.indicators(kernels.grouped(state)).stretch == pytest.approx(2.0)
 
 
-GOOD = Margins(courant=1.0, spin=0.5, jacobian=0.01, stretch=3.0, energy=0.05)  # at the limits
+GOOD = Indicators(
+    courant=1.0, velocity_increment=0.5, jacobian=0.01, stretch=3.0, energy=0.05
+)  # at the limits
 
 
 @pytest.mark.parametrize(
@@ -112,7 +121,7 @@ GOOD = Margins(courant=1.0, spin=0.5, jacobian=0.01, stretch=3.0, energy=0.05)  
     [
         ({}, 1),
         ({"courant": 1.01}, 3),
-        ({"spin": 0.51}, 3),
+        ({"velocity_increment": 0.51}, 3),
         ({"jacobian": 0.0099}, 3),
         ({"energy": 0.051}, 3),
         ({"stretch": 3.01}, 1),  # no step mends what is torn
@@ -123,9 +132,9 @@ def test_what_is_over_a_limit_is_tried_again_unless_it_is_torn_or_left_alone(
 ):
     steps = []
 
-    def watch(simulation):
+    def watch(simulation, instants):
         steps.append(simulation.scene.time_step)
-        return Watched(simulation.initial, None, GOOD._replace(**over))
+        return Watched({simulation.steps: simulation.initial}, GOOD._replace(**over))
 
     monkeypatch.setattr(Simulation, "watch", watch)
     scene = small_scene()
@@ -133,7 +142,15 @@ def test_what_is_over_a_limit_is_tried_again_unless_it_is_torn_or_left_alone(
     with pytest.raises(SimulationError) if over else contextlib.nullcontext():
         Problem(scene).value(x)
     assert steps == [4e-3, 2e-3, 1e-3][:tries]
-    assert np.isfinite(Problem(scene, redo=0).value(x))
+    assert np.isfinite(Problem(scene, halvings=0, limits=None).value(x))
+    # Whether limits count and whether a step is halved are two questions.
+    steps.clear()
+    with pytest.raises(SimulationError) if over else contextlib.nullcontext():
+        Problem(scene, halvings=0).value(x)
+    assert np.isfinite(Problem(scene, limits=None).value(x))
+    assert steps == [4e-3, 4e-3]
+    looser = Problem(scene, limits=Indicators(2.0, 1.0, 1e-3, 2.0, 0.1))
+    assert np.isfinite(looser.value(x))
 
 
 def test_a_window_holds_the_mirror_images_of_its_nodes():
@@ -142,7 +159,7 @@ def test_a_window_holds_the_mirror_images_of_its_nodes():
     world = world_of(small_scene())
 
     def window(axis, node):
-        return mpm.whole_window(windows, world._replace(mirror_axis=axis, mirror_node=node))
+        return kernels.whole_window(windows, world._replace(mirror_axis=axis, mirror_node=node))
 
     assert window(-1, 0) == (8, 3, 5, 3)
     assert window(0, 9) == (6, 3, 7, 3)

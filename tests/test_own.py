@@ -1,21 +1,23 @@
 """Nothing that is kept shares memory with the caller, and no result with what is kept."""
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
 from conftest import SHORT, small_scene
 
-from mpmopt.checkpoints import Checkpointing
-from mpmopt.design import DesignChain
-from mpmopt.discretisation import carried
+from mpmopt.assess.discretisation import carried
+from mpmopt.assess.trajectory import Body, Motion
+from mpmopt.design.chain import DesignChain
+from mpmopt.design.objective import Objective
+from mpmopt.design.problem import Problem
 from mpmopt.errors import DesignError, SimulationError
-from mpmopt.motion import Body, Motion
-from mpmopt.objective import Objective
-from mpmopt.optimize import optimise
-from mpmopt.particles import Particles, lay_out
-from mpmopt.problem import Problem
-from mpmopt.simulate import Memory, Simulation
+from mpmopt.optimisation.loop import optimise
+from mpmopt.scene.particles import Particles, discretise
+from mpmopt.simulation.buffers import Memory
+from mpmopt.simulation.checkpoints import Checkpointing
+from mpmopt.simulation.simulation import Simulation
 
 SCENE = small_scene(steps=12, transient=5 * 4e-3)
 
@@ -39,7 +41,7 @@ def spoil(*given):
 def parts():
     """What a simulation is made of, in arrays that anybody can write to."""
     rng = np.random.default_rng(7)
-    particles = lay_out(SCENE)
+    particles = discretise(SCENE)
     count = len(particles.position)
     state = np.zeros((12, count))
     state[0:2], state[8], state[11] = particles.position.T, 1.0, 1.1
@@ -53,13 +55,13 @@ def parts():
 
 def results(simulation, every, change=lambda: None, memory=None):
     with simulation.checkpoints(Checkpointing(every=every)) as store:
-        forward = simulation.forward(store, memory)
-        objective = Objective.of(simulation.particles, (1.0, 0.0))
-        seeds = objective.seed(forward.state), -objective.seed(forward.settled)
-        value = objective.value(forward.state, forward.settled)
+        objective = Objective.of(SCENE, simulation.particles)
+        forward = simulation.forward(store, memory, objective.instants)
+        seeds = objective.terminal_adjoints(forward.states)
+        value = objective.value(forward.states)
         change()
-        spoil(forward.state, forward.settled)
-        gradient = forward.reverse(*seeds)
+        spoil(*forward.states.values())
+        gradient = forward.reverse(seeds)
     return [np.array(value), *arrays(gradient).values()]
 
 
@@ -84,11 +86,14 @@ def test_what_a_simulation_returned_can_be_changed():
     problem = Problem(SCENE, 2.0)
     x = problem.join(0.3, 0.9, -0.3, -0.5)
     simulation = problem.simulation(x)
-    kept = [simulation.run([0, 5, 12]), simulation.run(), *simulation.watch()[:2]]
+    ask = [0, 5, 12]
+    watched = simulation.watch([5]).states
+    kept: list[Any] = [simulation.run(ask), simulation.run(), *watched.values()]
     evaluation = problem.evaluate(x)
     copies = [array.copy() for array in (*kept, evaluation.gradient)]
     spoil(*kept, evaluation.gradient)
-    again = [simulation.run([0, 5, 12]), simulation.run(), *simulation.watch()[:2]]
+    watched = simulation.watch([5]).states
+    again: list[Any] = [simulation.run(ask), simulation.run(), *watched.values()]
     again.append(problem.evaluate(x).gradient)
     assert all(np.array_equal(*pair) for pair in zip(copies, again))
     variables, shifted = problem.split(x), x + 1e-30j
@@ -104,8 +109,8 @@ def test_a_run_whose_memory_was_taken_is_not_gone_back_through():
         first = simulation.forward(store, memory)
         second = simulation.forward(store, memory)
         with pytest.raises(DesignError, match="memory"):
-            first.reverse(np.zeros((12, len(inputs["volume"]))))
-        second.reverse(np.zeros((12, len(inputs["volume"]))))
+            first.reverse({})
+        second.reverse({})
 
 
 @pytest.mark.parametrize("row", [0, 2])
@@ -123,15 +128,16 @@ def test_a_state_that_is_no_number_is_a_failure_by_name(row):
 def test_parts_of_a_problem_keep_their_own():
     inputs, _ = parts()
     particles = Particles(*inputs.values())
-    objective, chain = Objective.of(particles, (1.0, 0.0)), DesignChain(SCENE, particles, 2.0)
+    objective, chain = Objective.of(SCENE, particles), DesignChain(SCENE, particles, 2.0)
     state = parts()[1]["state"]
     designed = int(particles.designed.sum())
-    expected = objective.value(state), *chain.material(np.full(designed, 0.3))
+    expected = objective.centroid(state), chain.field(np.full(designed, 0.3)).density
     weight = objective.weight.copy()
     same = Objective(objective.direction, weight, objective.start)
     spoil(*inputs.values(), weight)
+    chain.field(np.zeros(designed))  # forgets the one before
     for found in (objective, same):
-        again = found.value(state), *chain.material(np.full(designed, 0.3))
+        again = found.centroid(state), chain.field(np.full(designed, 0.3)).density
         assert all(np.array_equal(*pair) for pair in zip(again, expected))
     with pytest.raises(ValueError, match="read-only"):
         particles.position[0] = 0.0
@@ -166,6 +172,7 @@ def test_an_optimisation_keeps_its_own():
 
     expected = optimise(SCENE, SHORT, x.copy())
     found = optimise(SCENE, SHORT, x, [spoilt])
+    assert found.last is not None and expected.last is not None
     assert np.array_equal(found.last.x, expected.last.x)
     assert [i.objective for i in found.history] == [i.objective for i in expected.history]
 

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from conftest import small_scene
 
-from mpmopt import audit, binary, motion
-from mpmopt.discretisation import Discretisation, cheapest, measure
-from mpmopt.motion import Motion
-from mpmopt.objective import Objective
-from mpmopt.problem import Problem
-from mpmopt.verify import report
+from mpmopt.assess import refinement, threshold, trajectory
+from mpmopt.assess.discretisation import Discretisation, cheapest, measure
+from mpmopt.assess.trajectory import Motion
+from mpmopt.assess.verify import report
+from mpmopt.design.objective import Objective
+from mpmopt.design.problem import Problem
 
 SCENE = small_scene(steps=16)
 UP = (0.6, 0.8)
@@ -21,7 +21,7 @@ class Climber(Problem):
     """Goes another way than its scene says."""
 
     def objective(self, simulation):
-        return Objective.of(simulation.particles, UP)
+        return Objective.of(simulation.scene, simulation.particles, UP)
 
 
 def smooth(problem):
@@ -37,23 +37,22 @@ def pair():
 
 def test_bodies_without_void_go_its_way(pair):
     x = smooth(pair[0])
-    for distance in (binary.post_processed, binary.unactuated, audit.least):
+    for distance in (threshold.post_processed, threshold.unactuated, refinement.least):
         own, same = (distance(problem, x) for problem in pair)
         assert own == same
-    block, split = binary.full_block, pair[0].split(x)
-    own = binary.farthest(SCENE, block, split, objective=pair[0].objective)
-    assert own == binary.farthest(pair[1].scene, block, split)
+    block, split = threshold.solid_reference, pair[0].split(x)
+    own = threshold.farthest(SCENE, block, split, objective=pair[0].objective)
+    assert own == threshold.farthest(pair[1].scene, block, split)
 
 
 def test_pictures_and_audits_show_it(pair):
     x = smooth(pair[0])
-    for body in (motion.optimised, motion.post_processed, motion.reference):
+    for body in (trajectory.optimised, trajectory.post_processed, trajectory.reference):
         own, same = (Motion.of(body(problem, x), [0, 8, 16]) for problem in pair)
         assert np.array_equal(own.objective, same.objective)
-    own, same = (audit.audit(problem, x) for problem in pair)
-    assert [(row.reference, row.distance) for row in own] == [
-        (row.reference, row.distance) for row in same
-    ]
+    audits = [refinement.audit(problem, x) for problem in pair]
+    own_rows, same_rows = ([(row.reference, row.distance) for row in rows] for rows in audits)
+    assert own_rows == same_rows
 
 
 def test_checks_and_measurements_are_of_it(pair):
@@ -63,9 +62,9 @@ def test_checks_and_measurements_are_of_it(pair):
     complex_steps = [[c.value for c in checks if "complex" in c.name] for checks in (own, same)]
     assert complex_steps[0] == complex_steps[1]
     here = Discretisation.of(SCENE)
-    own = measure(SCENE, here, smooth, 2.0, 1 / 16, kind=Climber)
-    same = measure(pair[1].scene, here, smooth, 2.0, 1 / 16)
-    assert own.travel == same.travel
-    assert np.array_equal(own.gradient, same.gradient)
+    measured = measure(SCENE, here, smooth, 2.0, 1 / 16, kind=Climber)
+    expected = measure(pair[1].scene, here, smooth, 2.0, 1 / 16)
+    assert measured.travel == expected.travel
+    assert np.array_equal(measured.gradient, expected.gradient)
     found = cheapest(SCENE, x, 1e9, beta=2.0, kind=Climber, seconds=1e-2)
     assert found.best in {row.measured.discretisation for row in found.rows}

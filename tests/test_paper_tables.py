@@ -8,7 +8,7 @@ import paper_tables
 import pytest
 import walker
 
-from mpmopt.optimize import Settings
+from mpmopt.optimisation.settings import Settings
 
 
 def test_a_line_counts_the_best_reference_and_the_share_of_the_gain_kept():
@@ -46,6 +46,7 @@ def tiny(monkeypatch):
         monkeypatch.setitem(module.CASES, "preview", short)
 
 
+@pytest.mark.case
 def test_both_cases_are_run_once_and_then_read(tiny, tmp_path, capsys):
     arguments = ["--out", str(tmp_path), "--setting", "preview"]
     assert paper_tables.main(arguments) == 0
@@ -67,6 +68,7 @@ def test_both_cases_are_run_once_and_then_read(tiny, tmp_path, capsys):
     assert {line.count("|") for line in table} == {11}
 
 
+@pytest.mark.case
 def test_a_run_of_other_settings_is_not_taken_for_the_tables(tiny, tmp_path, capsys):
     assert paper_tables.main(["--out", str(tmp_path), "--setting", "preview"]) == 0
     capsys.readouterr()

@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import shutil
 from io import BytesIO
+from typing import Any
 
 import matplotlib
 import matplotlib.style
@@ -15,16 +16,19 @@ from scipy.ndimage import binary_erosion, label
 from test_mirror import channel
 from walker import walker
 
-from mpmopt import draw, files, multistart, plot, runfile
 from mpmopt.__main__ import main
-from mpmopt.errors import RunFileError, SimulationError, StorageError
-from mpmopt.film import Screen
-from mpmopt.history import Iteration
-from mpmopt.motion import Motion, optimised
-from mpmopt.optimize import optimise
-from mpmopt.problem import Problem
+from mpmopt.app import multistart
+from mpmopt.assess.trajectory import Motion, optimised
+from mpmopt.design.problem import Problem
+from mpmopt.errors import DesignError, SimulationError, StorageError
+from mpmopt.io import files
+from mpmopt.optimisation.history import Iteration
+from mpmopt.optimisation.loop import optimise
+from mpmopt.results import runfile
 from mpmopt.scene import Design, Grid, Solid
-from mpmopt.schematic import schematic
+from mpmopt.view import draw, plot
+from mpmopt.view.film import Screen
+from mpmopt.view.schematic import schematic
 
 NAMES = {"schematic.png", "history.png", "design.png", "post_processed.png", "reference.png"}
 
@@ -53,7 +57,7 @@ def test_plot_draws_a_run_from_its_file(short_path, tmp_path, capsys):
     assert "5 of 5 pictures" in printed.err
 
 
-HOSTILE = {
+HOSTILE: dict[Any, Any] = {
     "text.usetex": True,  # LaTeX need not be there
     "font.family": "no such font",
     "axes.unicode_minus": False,
@@ -78,14 +82,14 @@ def test_pictures_are_the_same_whatever_the_users_style_is(
     small = functools.partial(draw.png, dpi=20)
     for module in (draw, plot):
         monkeypatch.setattr(module, "png", lambda figure, dpi=None: small(figure))
-    body = optimised(short_run.problem(), short_run.best)
+    body = optimised(short_run.problem(), short_run.result.x)
     motion = Motion.of(body, [0, 20])
     shutil.copytree(short_path.parent, tmp_path / "start-0")
     row = {"start": 0, "gain": 0.1, "audited_gain": 0.05}
 
     def content():
         plot.plot_motion(tmp_path / "motion.png", body, 1)
-        plot.plot_history(tmp_path / "history.png", short_run.run)
+        plot.plot_history(tmp_path / "history.png", short_run)
         multistart.draw(tmp_path / "starts.png", tmp_path, [row])
         for name in ("motion", "history", "starts"):
             yield (tmp_path / f"{name}.png").read_bytes()
@@ -108,8 +112,13 @@ def test_instants_and_distances_of_a_small_and_fast_robot_can_be_read(monkeypatc
         grid=Grid((16, 16), c), time_step=1e-6, steps=100, gravity=(1e2, 0.0), walls=(),
         body=(Solid((4 * c, 6 * c), (9 * c, 8 * c)),),
     )  # fmt: skip
-    figures = []
-    monkeypatch.setattr(plot, "png", lambda figure: figures.append(figure) or b"")
+    figures: list[Any] = []
+
+    def png(figure):
+        figures.append(figure)
+        return b""
+
+    monkeypatch.setattr(plot, "png", png)
     plot.plot_motion(tmp_path / "a.png", optimised(Problem(scene), np.empty(0)), 3)
     (figure,) = figures
     assert figure.get_suptitle() == "Optimised design, L = 0.000650505"  # it moved by 5e-7
@@ -133,7 +142,7 @@ def test_a_history_is_the_same_from_a_run_and_from_its_file(tmp_path):
     run = optimise(scene, SHORT, Problem(scene).join(0.0, 1.0, -0.3, -0.5))
     runfile.write(tmp_path / "run.h5", run)
     plot.plot_history(tmp_path / "a.png", run)
-    plot.plot_history(tmp_path / "b.png", runfile.read(tmp_path / "run.h5").run)
+    plot.plot_history(tmp_path / "b.png", runfile.read_run(tmp_path / "run.h5").run)
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
 
 
@@ -161,8 +170,9 @@ def test_a_history_marks_each_stage_and_failure_where_it_is():
     )
     lines = {line.get_label(): line for line in axes.lines}
     assert np.array_equal(lines["failed evaluation"].get_xdata(), [3])
-    assert np.array_equal(lines["objective L"].get_ydata()[:2], [0.2, 0.3])
-    marks = {text.xy[0]: text.get_text() for text in axes.texts}
+    assert np.array_equal(np.asarray(lines["objective L"].get_ydata())[:2], [0.2, 0.3])
+    texts: list[Any] = list(axes.texts)
+    marks = {text.xy[0]: text.get_text() for text in texts}
     assert marks == {0.5: r"$\beta$ = 0.5", 3.5: r"$\beta$ = 1", 4.5: r"$\beta$ = 0.5"}
 
 
@@ -175,7 +185,7 @@ def test_a_history_of_failures_alone_can_be_drawn():
 def test_a_run_without_a_design_is_an_error_and_leaves_nothing(tmp_path, capsys):
     runfile.write(tmp_path / "run.h5", empty(small_scene()))
     assert main(["plot", str(tmp_path / "run.h5")]) == 1
-    assert capsys.readouterr().err.startswith("RunFileError: the run file holds no design")
+    assert capsys.readouterr().err.startswith("DesignError: there is no design")
     assert [file.name for file in tmp_path.iterdir()] == ["run.h5"]
 
 
@@ -185,8 +195,8 @@ def test_an_unfinished_run_is_drawn_without_what_fails(short_run, tmp_path, capl
 
     for body in ("optimised", "post_processed", "reference"):
         monkeypatch.setattr(plot, body, fails)
-    unfinished = dataclasses.replace(short_run.run, stop_reason="")
-    plot.plot_run(tmp_path, dataclasses.replace(short_run, run=unfinished))
+    unfinished = dataclasses.replace(short_run, stop_reason="")
+    plot.plot_run(tmp_path, unfinished)
     assert {file.name for file in tmp_path.iterdir()} == {"schematic.png", "history.png"}
     assert "no reference.png: step 3, body: it burst" in caplog.text
 
@@ -240,25 +250,16 @@ def test_notebooks_show_pictures_and_terminals_a_sentence(short_run):
     assert "at stage 1 of 1, beta 4. Stage 1 of 1 was the last:" in str(short_run)
 
 
-def test_an_optimisation_shows_itself_as_its_file_does(tmp_path):
-    scene = small_scene(steps=10)
-    made = optimise(scene, SHORT, Problem(scene).join(0.0, 1.0, -0.3, -0.5))
-    runfile.write(tmp_path / "run.h5", made)
-    back = runfile.read(tmp_path / "run.h5")
-    assert repr(made) == repr(back)
-    assert made._repr_png_() == back._repr_png_()
-    none = empty(scene)
+def test_an_optimisation_without_a_design_shows_no_picture():
+    none = empty(small_scene(steps=10))
     assert repr(none) == "Run of 0 evaluations, 0 failed: no design yet. Not finished."
     assert none._repr_png_() is None
-    runfile.write(tmp_path / "run.h5", none)
-    assert runfile.read(tmp_path / "run.h5")._repr_png_() is None
 
 
 def test_a_run_that_failed_says_how():
     run = run_of(objective=[0.2, np.nan], failure=["", "step 3: it burst"])
-    kept = runfile.RunFile(run, {})
-    with pytest.raises(RunFileError, match=r"no design: .* last one failed: step 3: it burst"):
-        _ = kept.best
+    with pytest.raises(DesignError, match=r"no design: .* the last: step 3: it burst"):
+        _ = run.result
 
 
 def test_instants_of_a_tall_body_stand_in_one_row(tmp_path):

@@ -1,17 +1,18 @@
 """Objective and gradient of the whole chain."""
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
 from conftest import small_scene, worst
 from walker import walker
 
-from mpmopt.binary import distance, farthest, full_block, pieces, post_processed
-from mpmopt.checkpoints import Checkpointing
+from mpmopt.assess.threshold import distance, farthest, pieces, post_processed, solid_reference
+from mpmopt.assess.verify import COMPLEX_STEP, COMPLEX_TOLERANCE, complex_step_test
+from mpmopt.design.problem import Problem
 from mpmopt.errors import DesignError, SimulationError
-from mpmopt.problem import Problem
-from mpmopt.verify import COMPLEX_STEP, COMPLEX_TOLERANCE, complex_step_test
+from mpmopt.simulation.checkpoints import Checkpointing
 
 
 @pytest.fixture
@@ -25,7 +26,7 @@ def x(problem, rng):
 
 
 def test_gradient_of_the_preview_walker_over_all_its_steps(rng):
-    problem = Problem(walker(64, 8e-4).vary(mass_floor=1e-2, stiffness_floor=1e-3), beta=2.0)
+    problem = Problem(walker(64, 8e-4).vary(void_density=1e-2, void_stiffness=1e-3), beta=2.0)
     x = problem.join(rng.uniform(-1.0, 1.0, problem.size - 3), 0.9, -0.3, -0.5)
     errors = complex_step_test(problem, x)
     assert set(errors) == {
@@ -57,7 +58,7 @@ def test_after_a_transient_only_what_follows_counts_and_the_gradient_is_exact(fi
     whole = Problem(scene, beta=2.0)
     part = Problem(dataclasses.replace(scene, transient=first * scene.time_step), beta=2.0)
     simulation = whole.simulation(x)
-    start, before, end = map(whole.objective(simulation).value, simulation.run([0, first, 30]))
+    start, before, end = map(whole.objective(simulation).centroid, simulation.run([0, first, 30]))
     value, gradient = part.value_and_gradient(x)
     assert value == part.value(x) == pytest.approx(end - before + start, abs=1e-15)
     assert abs(value - whole.value(x)) > 1e-5
@@ -72,26 +73,26 @@ def test_after_a_transient_only_what_follows_counts_and_the_gradient_is_exact(fi
 
 def test_void_that_is_left_out_is_not_simulated_and_the_gradient_stays_exact(problem, x):
     gamma = problem.gamma(x)
-    leave_out = float(np.median(gamma))
-    part = Problem(problem.scene, problem.chain.beta, leave_out=leave_out)
+    void_cutoff = float(np.median(gamma))
+    part = Problem(problem.scene, problem.chain.beta, void_cutoff=void_cutoff)
     simulation = part.simulation(x)
-    fewer = (gamma < leave_out).sum()
+    fewer = (gamma < void_cutoff).sum()
     assert len(simulation.particles.position) == len(part.particles.position) - fewer
     assert 10 <= fewer < gamma.size
     assert worst(complex_step_test(part, x, directions=3)) <= COMPLEX_TOLERANCE
     # Void that weighs nothing does nothing; left out, it changes nothing.
-    light = problem.scene.vary(mass_floor=1e-9, stiffness_floor=1e-9)
-    sharp = problem.join(np.where(gamma > leave_out, 1.0, -1.0), [0.9, 0.5], 0.2, 0.1)
+    light = problem.scene.vary(void_density=1e-9, void_stiffness=1e-9)
+    sharp = problem.join(np.where(gamma > void_cutoff, 1.0, -1.0), [0.9, 0.5], 0.2, 0.1)
     with_void = Problem(dataclasses.replace(light, steps=5), 32.0)
-    without = Problem(dataclasses.replace(light, steps=5), 32.0, leave_out=1e-4)
+    without = Problem(dataclasses.replace(light, steps=5), 32.0, void_cutoff=1e-4)
     assert without.simulation(sharp).initial.size < with_void.simulation(sharp).initial.size
     assert without.value(sharp) == pytest.approx(with_void.value(sharp), rel=1e-7)
 
 
 @pytest.mark.parametrize("wrong", [np.nan, -1.0, 1.0, "a"])
 def test_a_senseless_limit_of_what_is_left_out_is_refused(scene, wrong):
-    with pytest.raises(DesignError, match="leave_out"):
-        Problem(scene, leave_out=wrong)
+    with pytest.raises(DesignError, match="void_cutoff"):
+        Problem(scene, void_cutoff=wrong)
 
 
 def test_value_is_that_of_value_and_gradient(problem, x):
@@ -201,7 +202,7 @@ def test_pieces_that_hang_on_nothing_are_numbered(problem):
 
 
 def test_a_result_that_is_not_finite_never_leaves(problem, x, monkeypatch):
-    monkeypatch.setattr("mpmopt.objective.Objective.value", lambda *_: np.nan)
+    monkeypatch.setattr("mpmopt.design.objective.Objective.value", lambda *_: np.nan)
     with pytest.raises(SimulationError, match="1 of 1 results are not finite"):
         problem.value_and_gradient(x)
 
@@ -213,8 +214,8 @@ def test_a_black_design_without_its_void_is_the_solid_body(problem):
     assert problem.value(black) == pytest.approx(value, rel=1e-13)
     assert post_processed(problem, black) == pytest.approx(value, rel=1e-13)
     still, moving = (problem.split(problem.join(0.0, a, -0.3, 0.0)) for a in (0.0, 0.9))
-    values = [farthest(problem.scene, full_block, v) for v in (still, moving)]
-    assert farthest(problem.scene, full_block, still, moving) == max(values)
+    values = [farthest(problem.scene, solid_reference, v) for v in (still, moving)]
+    assert farthest(problem.scene, solid_reference, still, moving) == max(values)
     assert distance(problem.scene, everything, moving) == values[1]
 
 
@@ -225,7 +226,7 @@ def test_a_design_is_transferred_to_another_grid_as_it_looks():
     phi = np.where(np.hypot(*centre.T) < 4 / 64, 1.0, -1.0)
     x = fine.transfer(coarse, coarse.join(phi, 0.9, -0.3, -0.5))
     parts = fine.split(x)
-    assert (parts.a, parts.theta, parts.b) == (0.9, -0.3, -0.5)
+    assert [*parts.a, *parts.theta, *parts.b] == [0.9, -0.3, -0.5]
     assert parts.phi.size == 4 * phi.size
     assert parts.phi.mean() == pytest.approx(phi.mean(), abs=1e-14)
     assert np.array_equal(coarse.split(coarse.transfer(fine, x)).phi, phi)
@@ -238,6 +239,7 @@ def test_removing_void_keeps_what_is_above_the_threshold(problem):
     expected = distance(problem.scene, gamma >= 0.3, problem.split(x))
     assert post_processed(problem, x) == expected
     assert post_processed(problem, x, threshold=gamma.min()) != expected
+    senseless: Any
     for senseless in (0.0, 1.0, 2.0, -0.3, np.nan, "0.3"):
         with pytest.raises(DesignError, match="must be between 0 and 1"):
             post_processed(problem, x, senseless)

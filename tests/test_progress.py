@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from mpmopt.progress import Progress
+from mpmopt.io.progress import Progress
 
 ROOT = Path(__file__).parent.parent
 WORK = """
-from mpmopt.progress import Progress
+from mpmopt.io.progress import Progress
 with Progress("steps", 20) as progress:
     for k in range(20):
         progress.step(f"number {k}")
@@ -82,6 +82,7 @@ def seen(said):
 needs_terminal = pytest.mark.skipif(not hasattr(os, "openpty"), reason="no pseudo-terminals")
 
 
+@pytest.mark.process
 @needs_terminal
 def test_on_a_terminal_there_is_a_bar_and_results_stay_whole():
     code, results, said = on_a_terminal(WORK)
@@ -96,8 +97,8 @@ def test_on_a_terminal_there_is_a_bar_and_results_stay_whole():
 LOGS = """
 import logging, sys, time, warnings
 from mpmopt.errors import StorageError
-from mpmopt.interrupt import reported
-from mpmopt.progress import Progress
+from mpmopt.io.console import reported
+from mpmopt.io.progress import Progress
 {setup}
 def work():
     progress = Progress("steps", 3)
@@ -116,6 +117,7 @@ sys.exit(code)
 """
 
 
+@pytest.mark.process
 @needs_terminal
 @pytest.mark.parametrize(("setup", "end"), [
     ("", "raise StorageError('no room')"),

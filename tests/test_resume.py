@@ -17,19 +17,20 @@ import numpy as np
 import pytest
 from conftest import small_scene
 
-from mpmopt import runfile
-from mpmopt.case import main
+from mpmopt.app.script import main
+from mpmopt.design.problem import Problem
 from mpmopt.errors import SimulationError, StorageError
-from mpmopt.files import locked, replace_file
-from mpmopt.interrupt import Interrupted, how_to_go_on, interruptible, reported
-from mpmopt.optimize import Settings, Stage, go_on, optimise
-from mpmopt.problem import Problem
-from mpmopt.seals import sealed
+from mpmopt.io.checksums import sealed
+from mpmopt.io.console import Interrupted, how_to_go_on, interruptible, reported
+from mpmopt.io.files import locked, replace_file
+from mpmopt.optimisation.loop import go_on, optimise
+from mpmopt.optimisation.settings import Settings, Stage
+from mpmopt.results import runfile
 
 STAGES = (
     Stage(0.5, 1e-2, 1e-3, 4e-3),
     Stage(2.0, 1e-2, 1e-3, 4e-3, solid=True),
-    Stage(8.0, 1e-2, 1e-3, 2e-3, solid=True, leave_out=0.1),
+    Stage(8.0, 1e-2, 1e-3, 2e-3, solid=True, void_cutoff=0.1),
 )
 SETTINGS = Settings(STAGES, window=1, least_iterations=4, most_iterations=4, scouting=2)
 
@@ -49,6 +50,7 @@ def fails(monkeypatch):
     monkeypatch.setattr(Problem, "evaluate", evaluate)
 
 
+@pytest.mark.case
 def test_an_optimisation_goes_on_from_any_evaluation(fails, tmp_path):
     scene = small_scene(steps=30)
     problem = Problem(scene)
@@ -65,7 +67,7 @@ def test_an_optimisation_goes_on_from_any_evaluation(fails, tmp_path):
     assert whole.history[-1].time_step == 1e-3
     wanted = faults.content(paths[-1])
     for path in paths:
-        back = runfile.read(path)
+        back = runfile.read_run(path)
         again = go_on(back.run)
         runfile.write(tmp_path / "again.h5", again)
         assert faults.content(tmp_path / "again.h5") == wanted, path.name
@@ -77,7 +79,7 @@ def test_all_that_a_run_is_comes_back_from_its_file(fails, tmp_path):
     scene = small_scene(steps=30)
     run = optimise(scene, SETTINGS, [Problem(scene).join(0.0, 1.0, t, 0.0) for t in (0.1, -0.1)])
     runfile.write(tmp_path / "run.h5", run)
-    runfile.write(tmp_path / "again.h5", runfile.read(tmp_path / "run.h5").run)
+    runfile.write(tmp_path / "again.h5", runfile.read_run(tmp_path / "run.h5").run)
     assert (tmp_path / "run.h5").read_bytes() == (tmp_path / "again.h5").read_bytes()
 
 
@@ -86,12 +88,14 @@ def whole(tmp_path_factory):
     return faults.finished(tmp_path_factory.mktemp("whole") / "out")
 
 
+@pytest.mark.process
 def test_a_killed_run_ends_as_it_would_have(whole, tmp_path):
     rows = faults.kills(tmp_path, whole, 3, random.Random(1))
     assert sum(row.done for row in rows) == 3
     assert all(row.survived == row.done for row in rows), rows
 
 
+@pytest.mark.process
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_signal_ends_a_run_with_its_code_and_says_how_to_go_on(whole, tmp_path, number, code):
     process = faults.Process(tmp_path / "out")
@@ -103,31 +107,29 @@ def test_a_signal_ends_a_run_with_its_code_and_says_how_to_go_on(whole, tmp_path
     assert faults.resumed(tmp_path / "out") == whole
 
 
-HANGS = """
-import ctypes
-from mpmopt.interrupt import interruptible
-with interruptible(lambda: "Advice."):
-    mutex, library = ctypes.create_string_buffer(64), ctypes.CDLL(None)
-    library.pthread_mutex_lock(mutex)
+LEAVES = """
+import time
+from mpmopt.io.console import interruptible
+with interruptible():
     try:
-        print("ready", flush=True)
-        library.pthread_mutex_lock(mutex)  # waits for ever, whatever the signal
-    except KeyboardInterrupt:  # came before it
-        library.pthread_mutex_lock(mutex)
+        print("at work", flush=True)
+        time.sleep(60)
+    finally:
+        print("leaving", flush=True)
+        time.sleep(60)
 """
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="calls the C library")
-def test_a_call_that_does_not_return_is_ended_from_outside():
-    process = subprocess.Popen(
-        [sys.executable, "-c", HANGS],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
-    assert process.stdout.readline() == "ready\n"
-    process.send_signal(signal.SIGTERM)
-    _, text = process.communicate(timeout=50)
-    assert process.returncode == 143
-    assert "stopped by SIGTERM. Advice." in text
+@pytest.mark.process
+@pytest.mark.parametrize("second", [signal.SIGINT, signal.SIGTERM])
+def test_a_second_signal_ends_the_process_at_once(second):
+    process = subprocess.Popen([sys.executable, "-c", LEAVES], stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    for said, number in (("at work\n", signal.SIGTERM), ("leaving\n", second)):
+        assert process.stdout.readline() == said
+        process.send_signal(number)
+    process.communicate(timeout=50)
+    assert process.returncode == -second
 
 
 def test_a_signal_that_a_library_swallows_is_not_lost(capfd):
@@ -135,20 +137,13 @@ def test_a_signal_that_a_library_swallows_is_not_lost(capfd):
     def callback():  # as a compiler has them
         os.kill(os.getpid(), signal.SIGTERM)
 
-    with pytest.raises(Interrupted, match="SIGTERM"), interruptible(lambda: "none"):
+    with pytest.raises(Interrupted, match="SIGTERM"), interruptible():
         callback()
         raise RuntimeError("no compiled object yet")
     assert capfd.readouterr().err == ""
 
 
-def test_of_two_signals_the_first_one_ends_the_run():
-    with pytest.raises(Interrupted, match="SIGINT"), interruptible(lambda: "none"):
-        try:
-            os.kill(os.getpid(), signal.SIGINT)
-        finally:
-            os.kill(os.getpid(), signal.SIGTERM)
-
-
+@pytest.mark.process
 def test_a_signal_ends_going_on_too_and_says_how_to_go_on(whole, tmp_path):
     process = faults.Process(tmp_path / "out")
     assert process.wait_for("reverse")
@@ -177,7 +172,7 @@ def test_the_advice_can_be_typed_and_is_true(tmp_path):
 
 def test_signals_are_given_back():
     before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
-    with pytest.raises(Interrupted, match="SIGTERM"), interruptible(lambda: "none"):
+    with pytest.raises(Interrupted, match="SIGTERM"), interruptible():
         os.kill(os.getpid(), signal.SIGTERM)
     assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before
 
@@ -190,16 +185,19 @@ def test_an_error_is_one_line_and_exit_code_one(capsys):
     assert capsys.readouterr().err == "StorageError: no room\n"
 
 
+@pytest.mark.process
 def test_a_write_that_fails_loses_nothing_that_was_saved(whole, tmp_path):
     rows = faults.full_disk(tmp_path, whole, 1, random.Random(2))
     assert all(row.survived == row.done for row in rows), rows
 
 
+@pytest.mark.process
 def test_scratch_files_on_disk_have_no_name_and_know_when_they_are_damaged(whole, tmp_path):
     rows = faults.scratch(tmp_path, whole)
     assert all(row.survived == row.done for row in rows), rows
 
 
+@pytest.mark.process
 def test_a_second_process_on_a_run_is_refused(whole, tmp_path):
     first = faults.Process(tmp_path / "out")
     assert first.wait_for("forward")
@@ -234,6 +232,7 @@ def test_files_are_as_private_as_the_user_has_them(tmp_path, umask, mode):
     assert (tmp_path / "run.h5").stat().st_mode & 0o777 == mode
 
 
+@pytest.mark.process
 def test_resume_of_no_run_is_an_error(tmp_path, capsys):
     command = [sys.executable, "-m", "mpmopt", "resume", str(tmp_path / "no" / "run.h5")]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -257,4 +256,4 @@ def test_other_versions_are_warned_of(tmp_path, caplog, monkeypatch):
     path.write_bytes(sealed(path.read_bytes()))
     assert main("A case.", {"default": tiny}, arguments) == 0
     assert "digits may differ" in caplog.text
-    assert np.isfinite(runfile.read(tmp_path / "run.h5").summary["optimised"])
+    assert np.isfinite(runfile.read_run(tmp_path / "run.h5").summary["optimised"])

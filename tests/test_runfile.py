@@ -11,13 +11,14 @@ import numpy as np
 import pytest
 from conftest import small_scene
 
-from mpmopt import runfile
 from mpmopt.__main__ import main
-from mpmopt.binary import post_processed
-from mpmopt.errors import RunFileError, StorageError
-from mpmopt.optimize import Settings, Stage, optimise
-from mpmopt.problem import Problem
-from mpmopt.seals import sealed
+from mpmopt.assess.threshold import post_processed
+from mpmopt.design.problem import Problem
+from mpmopt.errors import DesignError, RunFileError, StorageError
+from mpmopt.io.checksums import sealed
+from mpmopt.optimisation.loop import optimise
+from mpmopt.optimisation.settings import Settings, Stage
+from mpmopt.results import runfile
 
 STAGES = (Stage(0.5, 1e-2, 1e-3, 4e-3), Stage(2.0, 5e-3, 1e-3, 4e-3, solid=True))
 
@@ -37,28 +38,26 @@ def path(run, tmp_path):
 
 
 def test_a_run_is_read_back_as_it_was(run, path):
-    back = runfile.read(path)
+    found = runfile.read_run(path)
+    assert found.summary == {}
+    assert set(found.versions) == {"mpmopt", "python", "numba", "numpy", "scipy", "h5py"}
+    back = found.run
     assert back.scene == run.scene
     assert back.settings == run.settings
     assert back.stop_reason == run.stop_reason
-    assert back.summary == {}
-    assert set(back.versions) == {"mpmopt", "python", "numba", "numpy", "scipy", "h5py"}
-    for name in runfile.COLUMNS:
-        column = [getattr(item, name) for item in run.history]
-        assert np.array_equal(back.history[name], column, equal_nan=True)
-    assert list(back.history["failure"]) == [item.failure for item in run.history]
-    assert set(back.designs) == {0, 1}
+    for one, other in zip(back.history, run.history, strict=True):
+        assert repr(one) == repr(other)
+    assert set(back.best) == {0, 1}
     for stage, item in run.best.items():
-        assert np.array_equal(back.designs[stage], item.x)
-    assert back.problem().value(back.best) == run.result.objective
-    assert back.problem(0).value(back.designs[0]) == run.best[0].objective
+        assert np.array_equal(back.best[stage].x, item.x)
+    assert back.problem().value(back.result.x) == run.result.objective
 
 
 def test_a_halved_time_step_is_remembered(run, tmp_path):
     best = {0: dataclasses.replace(run.best[0], time_step=2e-3)}
     legs = [dataclasses.replace(run.legs[0], best=best)]
     runfile.write(tmp_path / "run.h5", dataclasses.replace(run, legs=legs))
-    assert runfile.read(tmp_path / "run.h5").problem().scene.time_step == 2e-3
+    assert runfile.read_run(tmp_path / "run.h5").run.problem().scene.time_step == 2e-3
 
 
 def test_the_best_design_is_there_by_name(run, path):
@@ -75,11 +74,11 @@ def test_an_unfinished_run_can_be_read(run, tmp_path):
     legs = [dataclasses.replace(run.legs[0], best={})]
     stopped = dataclasses.replace(run, history=run.history[:1], legs=legs, stop_reason="")
     runfile.write(path, stopped)
-    back = runfile.read(path)
-    assert back.designs == {}
+    back = runfile.read_run(path).run
+    assert back.best == {}
     assert back.stop_reason == ""
-    with pytest.raises(RunFileError, match="holds no design: no evaluation succeeded"):
-        _ = back.best
+    with pytest.raises(DesignError, match="no design: no evaluation succeeded"):
+        _ = back.result
 
 
 def test_writing_again_replaces_the_file_and_leaves_nothing_else(run, path):
@@ -122,7 +121,7 @@ def damaged(path, change, seal=True):
 )
 def test_a_damaged_run_file_is_refused(path, change):
     with pytest.raises(RunFileError, match=r"run\.h5"):
-        runfile.read(damaged(path, change))
+        runfile.read_run(damaged(path, change))
 
 
 @pytest.mark.parametrize(
@@ -137,7 +136,7 @@ def test_a_damaged_run_file_is_refused(path, change):
 )
 def test_whatever_changed_since_it_was_written_is_noticed(path, change):
     with pytest.raises(RunFileError, match=r"run\.h5.*dig"):
-        runfile.read(damaged(path, change, seal=False))
+        runfile.read_run(damaged(path, change, seal=False))
 
 
 def test_hdf5_never_sees_a_file_of_which_a_byte_changed(path, monkeypatch):
@@ -148,7 +147,7 @@ def test_hdf5_never_sees_a_file_of_which_a_byte_changed(path, monkeypatch):
         changed[place] ^= 1 << (place % 8)
         path.write_bytes(changed)
         with pytest.raises(RunFileError, match=r"run\.h5.*digest"):
-            runfile.read(path)
+            runfile.read_run(path)
 
 
 def replaced(name, *arguments, **options):
@@ -202,14 +201,14 @@ def virtual(file):
 )
 def test_what_no_run_file_holds_is_refused_before_it_is_read(path, change, says):
     with pytest.raises(RunFileError, match=says):
-        runfile.read(damaged(path, change))
+        runfile.read_run(damaged(path, change))
 
 
 def test_a_file_that_is_far_too_large_is_not_read(path):
     with path.open("r+b") as file:
         file.truncate(10**13)  # without content
     with pytest.raises(RunFileError, match="has 10000000000000 bytes, more than 1e"):
-        runfile.read(path)
+        runfile.read_run(path)
 
 
 def test_a_file_that_would_be_too_large_to_be_read_is_not_written(run, path, monkeypatch):
@@ -227,20 +226,20 @@ def test_a_truncated_run_file_is_refused(path, share):
     data = path.read_bytes()
     path.write_bytes(data[: int(share * len(data))])
     with pytest.raises(RunFileError, match=r"run\.h5"):
-        runfile.read(path)
+        runfile.read_run(path)
 
 
 def test_what_is_no_run_file_is_refused(tmp_path):
     with pytest.raises(RunFileError, match="not there"):
-        runfile.read(tmp_path / "run.h5")
+        runfile.read_run(tmp_path / "run.h5")
     text = tmp_path / "text.h5"
     text.write_text("not HDF5")
     with pytest.raises(RunFileError):
-        runfile.read(text)
+        runfile.read_run(text)
     with h5py.File(tmp_path / "other.h5", "w") as file:
         file["x"] = 1.0
     with pytest.raises(RunFileError, match="no run file"):
-        runfile.read(tmp_path / "other.h5")
+        runfile.read_run(tmp_path / "other.h5")
 
 
 @pytest.mark.skipif(not hasattr(resource, "RLIMIT_FSIZE"), reason="needs a file-size limit")
@@ -270,6 +269,7 @@ def command(*arguments):
     )  # fmt: skip
 
 
+@pytest.mark.process
 def test_verify_prints_its_checks_and_passes(path):
     done = command("verify", path)
     assert done.returncode == 0, done.stderr
@@ -279,6 +279,7 @@ def test_verify_prints_its_checks_and_passes(path):
         assert any(line.startswith(name) for line in lines)
 
 
+@pytest.mark.process
 def test_verify_of_no_run_file_says_so_and_fails(tmp_path):
     done = command("verify", tmp_path / "run.h5")
     assert done.returncode == 1
@@ -286,6 +287,7 @@ def test_verify_of_no_run_file_says_so_and_fails(tmp_path):
     assert "Traceback" not in done.stderr
 
 
+@pytest.mark.process
 def test_postprocess_prints_the_share_of_the_gain_kept(run, path):
     done = command("postprocess", path, "--threshold", "0.4")
     assert done.returncode == 0, done.stderr
@@ -306,6 +308,7 @@ def test_postprocess_refuses_a_threshold_that_makes_no_sense(path, capsys, thres
     assert said.err == f"DesignError: threshold = {threshold} must be between 0 and 1\n"
 
 
+@pytest.mark.process
 def test_an_unknown_command_is_not_understood():
     assert command("fly").returncode == 2
     assert "verify" in command("--help").stdout

@@ -4,16 +4,17 @@ import dataclasses
 import json
 import math
 from itertools import count
+from typing import Any
 
 import numpy as np
 import pytest
 from conftest import small_scene
 from walker import CASES, walker
 
-from mpmopt.design import DesignChain
+from mpmopt.design.chain import DesignChain
 from mpmopt.errors import SceneError
-from mpmopt.particles import lay_out
 from mpmopt.scene import Actuator, Design, Grid, Material, Region, Scene, Solid, Wall
+from mpmopt.scene.particles import discretise
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -73,6 +74,9 @@ def test_text_that_is_no_json_object_is_refused(text):
 C = 1 / 16
 
 
+WRONG: Any = ((1.0, 2.0), "left")  # of types that mypy refuses
+
+
 @pytest.mark.parametrize(
     ("build", "says"),
     [
@@ -80,12 +84,12 @@ C = 1 / 16
         (lambda: Grid((16, 16), -1.0), ["-1.0", "above 0"]),
         (lambda: Material(density=0.0), ["density", "0.0"]),
         (lambda: Material(lame_lambda=-1.0), ["-1.0"]),
-        (lambda: Material(mass_floor=2.0), ["2.0", "at most 1"]),
+        (lambda: Material(void_density=2.0), ["2.0", "at most 1"]),
         (lambda: Design((0.2, 0.2), (0.1, 0.3)), ["0.2", "0.1"]),
         (lambda: Actuator((0, 0), (1, 1), stress=((1.0, 2.0), (3.0, 1.0))), ["2.0", "3.0"]),
-        (lambda: Actuator((0, 0), (1, 1), stress=(1.0, 2.0)), ["2 entries"]),
+        (lambda: Actuator((0, 0), (1, 1), stress=WRONG[0]), ["2 entries"]),
         (lambda: Wall("y", 0.1, friction=-0.5), ["-0.5"]),
-        (lambda: Wall("y", 0.1, solid_side="left"), ["left"]),
+        (lambda: Wall("y", 0.1, solid_side=WRONG[1]), ["left"]),
         (lambda: small_scene(direction=(1.0, 1.0)), ["1.41421356", "length 1"]),
         (lambda: small_scene(filter_weights=(0.5, 0.1, 0.1)), ["1.3", "sum to 1"]),
         (lambda: small_scene(filter_length=-0.1), ["filter_length", "-0.1"]),
@@ -119,7 +123,7 @@ C = 1 / 16
         (lambda: small_scene(steps=10**30), ["from 1 to 1e+08"]),
         (lambda: small_scene().vary(time_step=1e-20), ["more than 1e+08 steps"]),
         (lambda: small_scene(time_step=0.1), ["0.1", "0.00988", "stability"]),
-        (lambda: small_scene(material=Material(mass_floor=1e-4)), ["0.004", "0.0031"]),
+        (lambda: small_scene(material=Material(void_density=1e-4)), ["0.004", "0.0031"]),
         (lambda: small_scene(material=Material(lame_mu=4.0)), ["lame_mu = 4", "-4"]),
         (lambda: small_scene(particles_per_cell=0), ["0", "from 1 to"]),
         (lambda: small_scene(particles_per_cell=101), ["101", "from 1 to 100"]),
@@ -150,7 +154,7 @@ def test_stability_limit_is_that_of_an_isolated_particle():
 
 
 def test_light_stiff_void_lowers_the_stability_limit(scene):
-    light = scene.vary(mass_floor=1e-3, stiffness_floor=2e-3)
+    light = scene.vary(void_density=1e-3, void_stiffness=2e-3)
     assert light.largest_time_step == pytest.approx(scene.largest_time_step / math.sqrt(2.0))
 
 
@@ -224,8 +228,8 @@ def test_the_filter_is_never_larger_than_what_is_refused(extent):
     # The estimate bounds the filter's entries per particle from above.
     scene = walker(64, 8e-4)
     scene = dataclasses.replace(scene, filter_length=extent / 8 * scene.grid.dx)
-    entries = DesignChain(scene, lay_out(scene), 1.0).filter.nnz
-    assert entries <= scene.filter_neighbours * lay_out(scene).designed.sum()
+    entries = DesignChain(scene, discretise(scene), 1.0).filter.nnz
+    assert entries <= scene.filter_neighbours * discretise(scene).designed.sum()
 
 
 def test_a_scene_cannot_be_changed(scene):
@@ -238,7 +242,7 @@ def test_edges_that_touch_but_for_rounding_do_not_overlap():
     left, right = Design((0.1, 0.1), (3 * 0.1, 0.5)), Solid((0.3, 0.1), (0.5, 0.5))
     assert left.upper[0] > right.lower[0]
     scene = Scene(grid, time_step=1e-3, steps=1, body=(left, right))
-    assert len(lay_out(scene).position) == 4 * 4 * 8 * 2
+    assert len(discretise(scene).position) == 4 * 4 * 8 * 2
 
 
 def test_a_region_that_is_neither_design_nor_solid_nor_actuator_is_refused():

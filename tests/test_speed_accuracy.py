@@ -10,8 +10,8 @@ import speed_accuracy
 from exact import Bar
 from speed_accuracy import BETA, PLAIN, ROBOTS, Point, design, front, settings
 
-from mpmopt.discretisation import Discretisation, Measured
-from mpmopt.problem import Problem
+from mpmopt.assess.discretisation import Discretisation, Measured
+from mpmopt.design.problem import Problem
 
 
 def bar_errors(n, courant, **options):
@@ -96,6 +96,7 @@ def test_all_points_can_be_laid_out_and_are_measured_once(quick):
         assert speed_accuracy.RECOMMENDED in points
 
 
+@pytest.mark.process
 @pytest.mark.parametrize("drawn", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_a_chart_is_left_with_its_tables(tmp_path, monkeypatch, drawn):
     if not drawn:

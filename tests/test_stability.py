@@ -24,10 +24,10 @@ from stability import (
 )
 from stability.common import Found
 
+from mpmopt.app.sweeps import as_csv
 from mpmopt.errors import SceneError, SimulationError
-from mpmopt.particles import lay_out
 from mpmopt.scene import Material
-from mpmopt.sweeps import as_csv
+from mpmopt.scene.particles import discretise
 
 # Time step.
 
@@ -58,13 +58,13 @@ def test_an_isolated_particle_is_stable_up_to_0_866():
 @pytest.mark.parametrize("shift", [0.0, 0.5])
 def test_a_free_block_is_stable_as_long_as_the_linearised_step(shift):
     scene = time_step.block_scene(steps=1000)
-    theory, measured = limits(lay_out(scene), scene, shift=shift)
+    theory, measured = limits(discretise(scene), scene, shift=shift)
     assert 0.96 <= theory <= 1.2
     assert measured == pytest.approx(theory, rel=0.015)
 
 
 def test_bulk_is_stable_longer_than_any_free_body():
-    position = lay_out(time_step.block_scene(6)).position
+    position = discretise(time_step.block_scene(6)).position
     ones = np.ones(len(position))
     theory = time_step.linear_limit(position, ones, ones, ones, period=6)
     assert theory == pytest.approx(1.306, abs=1e-3)
@@ -73,7 +73,7 @@ def test_bulk_is_stable_longer_than_any_free_body():
 def test_void_does_not_lower_the_limit_at_rest_unless_its_mass_floor_is_the_lower():
     equal = [weak.limit_at_rest(weak.floors(epsilon, heavy=False)) for epsilon in (1e-1, 1e-6)]
     assert equal == pytest.approx([1.11, 1.11], abs=0.01)
-    stiff = weak.limit_at_rest(Material(stiffness_floor=1e-1, mass_floor=1e-2))
+    stiff = weak.limit_at_rest(Material(void_stiffness=1e-1, void_density=1e-2))
     assert stiff == pytest.approx(equal[0] / np.sqrt(10.0), rel=0.1)
 
 
@@ -100,7 +100,7 @@ def test_a_heavy_mass_floor_cures_void_that_is_flung():
     light = weak.one_square("walker", 0.8, 1e-6, heavy=False, designs=3)
     assert light["failed"] > 0
     assert "smaller time step" in light["error"]
-    assert "higher mass floor" in light["error"]
+    assert "higher void density" in light["error"]
     heavy = weak.one_square("walker", 0.8, 1e-6, heavy=True, designs=3)
     assert (heavy["designs"], heavy["failed"]) == (3, 0)
     assert heavy["largest_deviation"] <= 0.01 * weak.GAIN

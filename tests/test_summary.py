@@ -1,18 +1,22 @@
 """What a study tells of a finished run, on numbers that are told instead of simulated."""
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
 from conftest import SHORT, small_scene
 
-from mpmopt import audit, binary, case
-from mpmopt.audit import Audited
-from mpmopt.case import Case, summarise
+from mpmopt.app import case, summary
+from mpmopt.app.case import Case
+from mpmopt.app.summary import summarise
+from mpmopt.assess import refinement, threshold
+from mpmopt.assess.refinement import Audited
+from mpmopt.design.problem import Problem
 from mpmopt.errors import SimulationError
-from mpmopt.history import Candidate, Leg, Optimisation
-from mpmopt.optimize import Settings
-from mpmopt.problem import Problem
+from mpmopt.optimisation import presets
+from mpmopt.optimisation.history import Candidate, Leg, Optimisation
+from mpmopt.optimisation.settings import Settings
 
 SCENE = small_scene()
 STAGE = SHORT.stages[0]
@@ -24,7 +28,8 @@ def candidate(phi, a, **changes):
     x = PROBLEM.join(phi, a, -0.3, -0.5)
     values = {
         "start": 0, "stage": 0, "beta": 4.0, "time_step": 4e-3, "move_limit": 0.1,
-        "objective": 0.5, "greyness": 0.25, "projected_gradient": 0.0, "step": 0.0, "seconds": 7.0,
+        "objective": 0.5, "non_discreteness": 0.25, "projected_gradient": 0.0, "step": 0.0,
+        "seconds": 7.0,
     }  # fmt: skip
     return Candidate(x=x, gamma=PROBLEM.gamma(x), **{**values, **changes})
 
@@ -40,7 +45,9 @@ def finished(best_phi=1.0):
 @pytest.fixture
 def told(monkeypatch):
     """Lets simulations of solid bodies be these numbers; what references were asked with."""
-    asked, rows, block = [], [], [0.3]
+    asked: list[Any] = []
+    rows: list[Audited] = []
+    block = [0.3]
 
     def farthest(scene, drawing, *actuations):
         keep = drawing(np.zeros((32, 2)))
@@ -51,15 +58,15 @@ def told(monkeypatch):
             raise SimulationError("made to fail", 3, 1, (0.0, 0.0), "none")
         return block[0]
 
-    monkeypatch.setattr(case, "farthest", farthest)
-    monkeypatch.setattr(case, "audit", lambda problem, x: rows)
-    monkeypatch.setattr(case, "post_processed", lambda problem, x: 0.45)
-    monkeypatch.setattr(case, "unactuated", lambda problem, x: 0.05)
+    monkeypatch.setattr(summary, "farthest", farthest)
+    monkeypatch.setattr(summary, "audit", lambda problem, x: rows)
+    monkeypatch.setattr(summary, "post_processed", lambda problem, x: 0.45)
+    monkeypatch.setattr(summary, "unactuated", lambda problem, x: 0.05)
 
     def tell(references, distances, of_block=0.3):
         block[0] = of_block
-        numbers = zip(NAMES, references, distances)
-        rows[:] = [Audited(name, (16, 16), 4e-3, *two, kept=0.9) for name, *two in numbers]
+        numbers = zip(NAMES, zip(references, distances))
+        rows[:] = [Audited(name, (16, 16), 4e-3, r, d, kept=0.9) for name, (r, d) in numbers]
         return asked
 
     return tell
@@ -93,9 +100,9 @@ def test_a_summary_is_of_the_best_design_and_counts_all_evaluations(told):
     summary = summarise(finished(), {})
     wanted = {
         "start": 0.1, "optimised": 0.5, "post_processed": 0.45, "actuation_off": 0.05,
-        "post_processed_half_step": 0.35, "greyness": 0.25, "a": [0.75, 0.75],
+        "post_processed_half_step": 0.35, "non_discreteness": 0.25, "a": [0.75, 0.75],
         "theta": [-0.3, -0.3], "b": [-0.5, -0.5], "evaluations": 3, "failed_evaluations": 1,
-        "redone_evaluations": 0, "seconds": 7.0, "stop_reason": "It ended.",
+        "halved_evaluations": 0, "seconds": 7.0, "stop_reason": "It ended.",
     }  # fmt: skip
     assert {name: summary[name] for name in wanted} == wanted
     assert summary["gain_kept"] == {name: 0.9 for name in NAMES[1:]}
@@ -105,11 +112,11 @@ def test_loose_particles_are_those_that_hang_on_nothing(told):
     told((0.1,) * 4, (0.5,) * 4)
     height = PROBLEM.particles.position[PROBLEM.particles.designed][:, 1]
     low = np.where(height < 4.6 / 16, 1.0, -1.0)  # the lowest row; solid begins at 6 / 16
-    kept = binary.kept(PROBLEM, candidate(low, 0.75).x).sum()
+    kept = threshold.kept(PROBLEM, candidate(low, 0.75).x).sum()
     assert 8 <= kept <= 24
-    assert summarise(finished(low), {})["loose_particles"] == kept
-    assert summarise(finished(1.0), {})["loose_particles"] == 0
-    assert summarise(finished(-1.0), {})["loose_particles"] == 0
+    assert summarise(finished(low), {})["disconnected_particles"] == kept
+    assert summarise(finished(1.0), {})["disconnected_particles"] == 0
+    assert summarise(finished(-1.0), {})["disconnected_particles"] == 0
 
 
 def test_scouts_start_a_quarter_turn_apart(tmp_path, monkeypatch):
@@ -117,7 +124,7 @@ def test_scouts_start_a_quarter_turn_apart(tmp_path, monkeypatch):
     settings = dataclasses.replace(SHORT, scouting=1)
     start = {"theta": (0.9, -0.75), "a": 0.5, "b": 0.25}
     study = Case(SCENE, settings, lambda position: position[:, 0] > 0.0, start)
-    legs = case.run(study, tmp_path / "scouts")
+    legs: Any = case.run(study, tmp_path / "scouts")
     designs = [PROBLEM.split(leg.x) for leg in legs]
     assert [design.theta.tolist() for design in designs] == pytest.approx(
         np.array([(0.9, -0.75), (-0.6, -0.25), (-0.1, 0.25), (0.4, 0.75)])
@@ -126,7 +133,8 @@ def test_scouts_start_a_quarter_turn_apart(tmp_path, monkeypatch):
         (0.5, 0.5, 0.25, 0.25, *32 * (0.0,))
     }
     one = dataclasses.replace(study, settings=SHORT)
-    (leg,) = case.run(one, tmp_path / "one")
+    legs = case.run(one, tmp_path / "one")
+    (leg,) = legs
     assert PROBLEM.split(leg.x).theta.tolist() == [0.9, -0.75]
 
 
@@ -140,7 +148,7 @@ def test_a_drawing_is_kept_for_each_coarsening_of_the_stages(tmp_path, monkeypat
     body = tuple(dataclasses.replace(part, **two) for part, two in zip(SCENE.body, twice))
     scene = small_scene(body=body, walls=())
     study = Case(scene, Settings(stages), lambda position: position[:, 1] < 10 / 16)
-    drawing = case.run(study, tmp_path)
+    drawing: Any = case.run(study, tmp_path)
     assert {name: (there.size, there.sum()) for name, there in drawing.items()} == {
         2: (32, 16), 1: (128, 64),
     }  # fmt: skip
@@ -149,13 +157,13 @@ def test_a_drawing_is_kept_for_each_coarsening_of_the_stages(tmp_path, monkeypat
 def test_a_share_of_the_gain_is_over_the_block_in_the_same_discretisation(monkeypatch):
     # (block, design) in each row; the gain as designed is 0.4.
     values = iter((0.1, 0.5, 0.2, 0.4, 0.3, 0.2, 0.0, 0.5))
-    monkeypatch.setattr(audit, "distance", lambda *_: next(values))
+    monkeypatch.setattr(refinement, "distance", lambda *_: next(values))
     x = PROBLEM.join(1.0, 0.5, 0.0, 0.0)
-    rows = audit.audit(PROBLEM, x)
+    rows = refinement.audit(PROBLEM, x)
     assert [row.kept for row in rows] == pytest.approx([1.0, 0.5, -0.25, 1.25])
     for design in (0.5, 0.4):  # no gain, and a loss
         values = iter((0.5, design, 0.2, 0.4, 0.3, 0.2, 0.0, 0.5))
-        assert all(np.isnan(row.kept) for row in audit.audit(PROBLEM, x))
+        assert all(np.isnan(row.kept) for row in refinement.audit(PROBLEM, x))
 
 
 def test_the_least_of_an_audit_is_of_half_the_step_and_half_the_cells(monkeypatch):
@@ -165,19 +173,19 @@ def test_the_least_of_an_audit_is_of_half_the_step_and_half_the_cells(monkeypatc
         asked.append((scene.time_step, scene.steps, scene.grid.cells, keep.size))
         return values[len(asked) % 2]
 
-    monkeypatch.setattr(audit, "distance", distance)
+    monkeypatch.setattr(refinement, "distance", distance)
     x = PROBLEM.join(1.0, 0.5, 0.0, 0.0)
     for values in ((0.4, 0.2), (0.1, 0.3)):
-        assert audit.least(PROBLEM, x) == min(values)
+        assert refinement.least(PROBLEM, x) == min(values)
     assert asked[:2] == [(2e-3, 80, (16, 16), 32), (2e-3, 80, (32, 32), 128)]
 
 
 def test_a_design_on_finer_cells_takes_each_particle_from_the_nearest():
     phi = np.where(PROBLEM.particles.position[PROBLEM.particles.designed][:, 0] < 5 / 16, 1.0, -1.0)
     x = PROBLEM.join(phi, 0.5, 0.0, 0.0)
-    fine = Problem(audit.refined(SCENE))
-    there = audit.laid_out(fine.scene, PROBLEM, x)
-    keep = binary.kept(PROBLEM, x)
+    fine = Problem(refinement.refined(SCENE))
+    there = refinement.mapped(fine.scene, PROBLEM, x)
+    keep = threshold.kept(PROBLEM, x)
     assert 0 < keep.sum() < keep.size
     assert there.sum() == 4 * keep.sum()
     position = fine.particles.position[fine.particles.designed]
@@ -192,9 +200,9 @@ def test_what_is_kept_includes_the_threshold():
     rng = np.random.default_rng(3)
     x = PROBLEM.join(rng.uniform(-1.0, 1.0, 32), 0.5, 0.0, 0.0)
     gamma = np.sort(PROBLEM.gamma(x))
-    assert binary.kept(PROBLEM, x, threshold=float(gamma[20])).sum() == 12
-    assert np.array_equal(binary.kept(PROBLEM, x), PROBLEM.gamma(x) >= 0.3)
-    part = Problem(SCENE, 4.0, leave_out=float(gamma[20]))
+    assert threshold.kept(PROBLEM, x, threshold=float(gamma[20])).sum() == 12
+    assert np.array_equal(threshold.kept(PROBLEM, x), PROBLEM.gamma(x) >= 0.3)
+    part = Problem(SCENE, 4.0, void_cutoff=float(gamma[20]))
     assert part.present(part.split(x).phi).sum() == 16 + 12
 
 
@@ -202,18 +210,21 @@ def test_pieces_hold_together_over_edges_not_over_corners():
     index = np.rint(PROBLEM.particles.position[PROBLEM.particles.designed] * 32 - 0.5).astype(int)
     i, j = (index - index.min(axis=0)).T
     stairs = (i == j) & (i < 3)  # three particles, corner to corner, below the solid
-    assert sorted(binary.pieces(SCENE, stairs)[stairs]) == [1, 2, 3]
+    assert sorted(threshold.pieces(SCENE, stairs)[stairs]) == [1, 2, 3]
     row = (j == 0) & (i < 3)
-    assert set(binary.pieces(SCENE, row)[row]) == {1}
+    assert set(threshold.pieces(SCENE, row)[row]) == {1}
 
 
 def test_without_actuation_nothing_works_on(monkeypatch):
-    asked = []
-    monkeypatch.setattr(
-        binary, "distance", lambda scene, keep, v, _: asked.append((keep, v)) or 0.125
-    )
+    asked: list[Any] = []
+
+    def distance(scene, keep, v, _):
+        asked.append((keep, v))
+        return 0.125
+
+    monkeypatch.setattr(threshold, "distance", distance)
     x = PROBLEM.join(np.linspace(-1.0, 1.0, 32), 0.5, 0.25, 0.75)
-    assert binary.unactuated(PROBLEM, x) == 0.125
+    assert threshold.unactuated(PROBLEM, x) == 0.125
     ((keep, v),) = asked
     assert np.array_equal(keep, PROBLEM.gamma(x) >= 0.3)
     assert (v.a.tolist(), v.theta.tolist(), v.b.tolist()) == ([0.0, 0.0], [0.25, 0.25], [0.0, 0.0])
@@ -228,11 +239,11 @@ def test_a_reference_takes_the_best_actuation_of_those_that_run(monkeypatch):
             raise SimulationError("made to fail", 3, 1, (0.0, 0.0), "none")
         return found[a]
 
-    monkeypatch.setattr(binary, "distance", distance)
+    monkeypatch.setattr(threshold, "distance", distance)
 
     def farthest(*amplitudes):
         actuations = [PROBLEM.split(PROBLEM.join(0.0, a, 0.0, 0.0)) for a in amplitudes]
-        return binary.farthest(SCENE, binary.full_block, *actuations)
+        return threshold.farthest(SCENE, threshold.solid_reference, *actuations)
 
     assert farthest(0.25, 0.5, 0.75) == 0.3
     assert farthest(1.0, 0.25) == farthest(0.25, 1.0) == 0.1
@@ -244,24 +255,24 @@ def test_a_distance_after_a_transient_counts_from_there():
     # The body falls to one side at once.
     scene = small_scene(steps=6, transient=3 * 4e-3, gravity=(5.0, 0.0), walls=())
     keep, variables = np.ones(32, dtype=bool), PROBLEM.split(PROBLEM.join(1.0, 0.5, 0.0, 0.0))
-    simulation, objective = binary.solid_body(scene, keep, variables)
+    simulation, objective = threshold.solid_body(scene, keep, variables)
     states = simulation.run([3, 6])
-    settled, end = (objective.value(state) for state in states)
+    settled, end = (objective.centroid(state) for state in states)
     expected = objective.start + end - settled
-    assert binary.distance(scene, keep, variables) == pytest.approx(expected, rel=1e-13)
+    assert threshold.distance(scene, keep, variables) == pytest.approx(expected, rel=1e-13)
     assert abs(expected - end) > 1e-6
 
 
 def test_the_presets_are_what_they_say():
-    sharp = case.sharpened(1e-3)
+    sharp = presets.continuation(1e-3)
     assert [stage.beta for stage in sharp.stages] == [0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0]
     late = [False] * 4 + [True] * 3
     assert [stage.solid for stage in sharp.stages] == late
     assert [stage.audited for stage in sharp.stages] == late
-    assert [stage.leave_out > 0.0 for stage in sharp.stages] == late
+    assert [stage.void_cutoff > 0.0 for stage in sharp.stages] == late
     assert (sharp.adapt_move_limit, sharp.sharpen_asymptotes, sharp.best_first) == 3 * (True,)
 
-    fine = case.refined(2e-3, 1e-3)
+    fine = presets.coarse_to_fine(2e-3, 1e-3)
     coarse, rest = fine.stages[:5], fine.stages[5:]
     assert [stage.beta for stage in coarse] == [0.5, 1.0, 2.0, 4.0, 8.0]
     assert {(stage.coarsening, stage.time_step, stage.audited) for stage in coarse} == {
@@ -274,10 +285,11 @@ def test_the_presets_are_what_they_say():
     }
     assert (fine.scouting, fine.tolerance) == (3, 0.0)
 
-    paper = case.published(1e-3)
+    paper = presets.paper_preset(1e-3)
     assert [stage.beta for stage in paper.stages] == [0.5, 1.0, 2.0, 4.0, 8.0, 16.0]
-    assert {(s.mass_floor, s.stiffness_floor, s.move_limit, s.redo) for s in paper.stages} == {
-        (1e-3, 1e-3, 0.5, 0)
+    assert {(s.void_density, s.void_stiffness, s.move_limit) for s in paper.stages} == {
+        (1e-3, 1e-3, 0.5)
     }
+    assert {(s.halvings, s.limited) for s in paper.stages} == {(0, False)}
     assert (paper.adapt_move_limit, paper.sharpen_asymptotes, paper.best_first) == 3 * (False,)
     assert (paper.window, paper.tolerance) == (10, 2e-4)

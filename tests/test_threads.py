@@ -8,13 +8,15 @@ import pytest
 from crawler import crawler
 from numba import njit
 
-from mpmopt import mpm, threads
-from mpmopt.checkpoints import Checkpointing
+from mpmopt import kernels
+from mpmopt.design.problem import Problem
 from mpmopt.errors import MpmoptError, SimulationError
-from mpmopt.particles import lay_out
-from mpmopt.problem import Problem
 from mpmopt.scene import Grid, Scene, Solid
-from mpmopt.simulate import Memory, Simulation, _Segment
+from mpmopt.scene.particles import discretise
+from mpmopt.simulation import threads
+from mpmopt.simulation.buffers import Memory, Segment
+from mpmopt.simulation.checkpoints import Checkpointing
+from mpmopt.simulation.simulation import Simulation
 
 jit_loop = njit(nogil=True)
 
@@ -56,8 +58,8 @@ def test_threads_that_do_not_start_are_done_without(monkeypatch, caplog):
 
 
 @jit_loop
-def wait_for_each_other(meeting, thread, threads):
-    return mpm.meet(meeting, threads)
+def wait_for_each_other(barrier_state, thread, threads):
+    return kernels.meet(barrier_state, threads)
 
 
 @pytest.mark.parametrize("failing", [0, 1, 2])
@@ -66,25 +68,25 @@ def test_no_thread_waits_for_one_that_failed(monkeypatch, failing, error):
     monkeypatch.setenv("MPMOPT_THREADS", "3")
     came = []
 
-    def loop(meeting, thread, number):
+    def loop(barrier_state, thread, number):
         if thread == failing:
             raise error("in one thread")
-        came.append(wait_for_each_other(meeting, thread, number))
+        came.append(wait_for_each_other(barrier_state, thread, number))
 
     before = threading.active_count()
     with pytest.raises(error, match="in one thread"):
-        threads.together(3, 1, loop)
+        threads.in_parallel(3, loop)
     assert threading.active_count() == before
     assert came == [False, False]
     came.clear()
-    assert threads.together(3, 1, wait_for_each_other) is True
+    assert threads.in_parallel(3, wait_for_each_other) is True
 
 
 def body_of(steps=40):
     """Gravity-free, of several blocks, as a simulation with a state to spoil."""
     c = 1 / 64
     scene = Scene(Grid((64, 64), c), 1e-3, steps, body=(Solid((10 * c, 10 * c), (40 * c, 30 * c)),))
-    particles = lay_out(scene)
+    particles = discretise(scene)
     ones = np.ones(len(particles.position))
     state = np.zeros((12, len(ones)))
     state[0:2], state[8], state[11] = particles.position.T, 1.0, 1.0
@@ -117,10 +119,10 @@ def test_windows_that_outgrow_their_room_get_what_they_need_and_change_no_bit(mo
     room = falling.room
     ends = set()
     for nodes, part in (room, (10, room[1]), (room[0], 10), (10, 10)):
-        memory = _Segment(falling, 20, Memory())
+        memory = Segment(falling, 20, Memory())
         memory.grids = memory.grids[:, :, :0]
         memory.resize(nodes, part)
-        memory.states[0] = mpm.grouped(falling.initial)
+        memory.states[0] = kernels.grouped(falling.initial)
         memory.advance(0, 20)
         ends.add(memory.states[20].tobytes())
         assert memory.grids.shape[2] <= room[0]
@@ -128,45 +130,12 @@ def test_windows_that_outgrow_their_room_get_what_they_need_and_change_no_bit(mo
     assert len(ends) == 1
 
 
-def test_the_faster_number_of_threads_is_taken_and_the_other_tried_again():
-    pace, taken = threads.Pace(), []
-    seconds = {True: 10.0, False: 1.0}  # busy: all threads wait for one another
-
-    def calls(number):
-        for _ in range(number):
-            with_all = pace.choose()
-            taken.append(with_all)
-            pace.note(with_all, 100.0 if len(taken) == 1 else seconds[with_all])
-
-    calls(1000)
-    # The first call compiles; then each once; then alone, but for tries that become rare.
-    assert taken[:3] == [True, True, False]
-    tries = np.flatnonzero(taken)[2:]
-    assert 4 <= len(tries) <= 8
-    assert np.all(np.diff(tries)[1:] >= np.diff(tries)[:-1])
-    seconds[True] = 0.5  # quiet again
-    taken.clear()
-    taken.append(False)
-    calls(3 * threads.LATE)
-    assert np.mean(taken[threads.LATE + 2 :]) > 0.9
-
-
 def test_a_wish_for_a_number_of_threads_is_kept(monkeypatch):
     monkeypatch.setenv("MPMOPT_THREADS", "2")
     seen = []
     for _ in range(3):
-        threads.together(2, 1, lambda meeting, thread, number: seen.append(number))
+        threads.in_parallel(2, lambda barrier_state, thread, number: seen.append(number))
     assert seen == [2] * 6
-    monkeypatch.delenv("MPMOPT_THREADS")
-    monkeypatch.setattr(threads, "threads", lambda: 2)
-    seen.clear()
-
-    def loop(meeting, thread, number):
-        seen.append(number)
-
-    for _ in range(3):
-        threads.together(2, 1, loop)
-    assert seen == [2, 2, 2, 2, 1]
 
 
 def test_without_the_compiler_there_is_one_thread(monkeypatch):

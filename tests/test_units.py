@@ -8,11 +8,14 @@ import pytest
 from conftest import small_scene
 
 from mpmopt import __main__ as commands
-from mpmopt import binary, runfile
-from mpmopt.case import ProgressBar, summarise, table
-from mpmopt.multistart import random_start, report
-from mpmopt.optimize import Settings, Stage, optimise
-from mpmopt.problem import Problem
+from mpmopt.app.case import ProgressBar
+from mpmopt.app.multistart import random_start, report
+from mpmopt.app.summary import summarise, table
+from mpmopt.assess import threshold
+from mpmopt.design.problem import Problem
+from mpmopt.optimisation.loop import optimise
+from mpmopt.optimisation.settings import Settings, Stage
+from mpmopt.results import runfile
 from mpmopt.scene import Actuator, Grid
 
 # What is a length; the rest has no unit.
@@ -60,7 +63,7 @@ def optimised(length=1.0, mass=1.0, time=1.0):
     scene = scaled(scene, length, mass, time)
     stages = (
         Stage(0.5, 1e-2, 1e-3, 4e-3 * time),
-        Stage(8.0, 1e-2, 1e-3, 4e-3 * time, solid=True, audited=True, leave_out=0.05),
+        Stage(8.0, 1e-2, 1e-3, 4e-3 * time, solid=True, audited=True, void_cutoff=0.05),
     )
     settings = Settings(stages, window=3, tolerance=1e-4, least_iterations=4, most_iterations=40)
     designs = []
@@ -106,8 +109,8 @@ def test_other_units_lead_to_the_same_steps_bit_for_bit(plain, length, mass, tim
     one, two = summarise(one, {}), summarise(other, {})
     for name in ("start", "reference", "optimised", "post_processed", "post_processed_half_step"):
         assert two[name] == (None if one[name] is None else length * one[name])
-    assert [two[name] for name in ("gain_kept", "greyness", "a", "theta", "b")] == [
-        one[name] for name in ("gain_kept", "greyness", "a", "theta", "b")
+    assert [two[name] for name in ("gain_kept", "non_discreteness", "a", "theta", "b")] == [
+        one[name] for name in ("gain_kept", "non_discreteness", "a", "theta", "b")
     ]
     assert one["post_processed_half_step"] is not None
 
@@ -134,11 +137,11 @@ def test_what_is_printed_of_a_small_robot_has_digits(tmp_path, capsys):
     # Half a millimetre long, in metres.
     summary = finished(tmp_path / "run.h5", scaled(small_scene(steps=20), 2e-3, 1.0, 1.0))
     (progress,) = capsys.readouterr().err.splitlines()
-    are_told(re.search(r"L ([^,]+),", progress)[1], 1)
+    are_told(re.findall(r"L ([^,]+),", progress)[0], 1)
     lengths = {name: summary[name] for name in ("start", "reference", "optimised", "gain")}
     are_told(table(lengths), 7)
-    kept = runfile.read(tmp_path / "run.h5")
-    are_told(re.search(r"best L = (\S+)", repr(kept))[1], 1)
+    kept = runfile.read_run(tmp_path / "run.h5").run
+    are_told(re.findall(r"best L = (\S+)", repr(kept))[0], 1)
     assert commands.main(["postprocess", str(tmp_path / "run.h5")]) == 0
     are_told("\n".join(line.split("(gamma")[0] for line in capsys.readouterr().out.split("\n")), 3)
     assert commands.main(["audit", str(tmp_path / "run.h5")]) == 0
@@ -151,7 +154,7 @@ def test_what_is_printed_of_a_small_robot_has_digits(tmp_path, capsys):
 def test_what_is_printed_of_several_small_starts_has_digits():
     row = {
         "post_processed": 6.1e-4, "gain": 1.234e-4, "kept_half_step": 1.0, "kept_half_cells": 0.5,
-        "audited_gain": 6e-5, "loose_particles": 0, "failed_evaluations": 0, "seconds": 1.0,
+        "audited_gain": 6e-5, "disconnected_particles": 0, "failed_evaluations": 0, "seconds": 1.0,
     }  # fmt: skip
     text = report([{"start": 0, **row}, {"start": 1, **row, "gain": 1.3e-4, "audited_gain": 5e-5}])
     lines = text.splitlines()
@@ -160,6 +163,6 @@ def test_what_is_printed_of_several_small_starts_has_digits():
 
 
 def test_a_gain_that_is_rounding_is_none():
-    assert binary.beyond_rounding(small_scene(), -4e-19) == 0.0
-    assert binary.beyond_rounding(small_scene(), 4e-9) == 4e-9
+    assert threshold.beyond_rounding(small_scene(), -4e-19) == 0.0
+    assert threshold.beyond_rounding(small_scene(), 4e-9) == 4e-9
     assert table({"gain": {"as designed": 0.0, "half the step": None}}).split("  ")[-1] == "-"

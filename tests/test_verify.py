@@ -15,16 +15,16 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from walker import walker
 
-from mpmopt.errors import DesignError, MpmoptError
-from mpmopt.problem import Problem
-from mpmopt.scene import Actuator, Grid, Scene
-from mpmopt.verify import (
+from mpmopt.assess.verify import (
     DOT_TOLERANCE,
     contact_free,
     dot_product_mismatch,
     report,
     taylor_test,
 )
+from mpmopt.design.problem import Problem
+from mpmopt.errors import DesignError, MpmoptError
+from mpmopt.scene import Actuator, Grid, Scene
 
 ROOT = Path(__file__).parent.parent
 
@@ -50,7 +50,7 @@ def test_a_report_passes_without_design_or_without_actuators(parts):
 
 def test_a_report_on_a_sharp_stiff_design_knows_what_rounding_does(rng):
     # All steps of the preview's walker, nearly black and white, at beta = 32.
-    problem = Problem(walker(64, 8e-4).vary(mass_floor=1e-2), beta=32.0)
+    problem = Problem(walker(64, 8e-4).vary(void_density=1e-2), beta=32.0)
     blocks = problem.particles.position[problem.particles.designed] * 64
     phi = np.where((blocks // 3).astype(int).sum(axis=1) % 2 == 0, 0.2, -0.2)
     checks = report(problem, problem.join(phi, 1.0, -0.7, -1.0))
@@ -101,10 +101,12 @@ def verdicts():
     return json.loads(done.stdout)
 
 
+@pytest.mark.process
 def test_the_right_adjoint_passes_all_checks(verdicts):
     assert verdicts["nothing"] == {"dot": True, "complex step": True, "Taylor": True}
 
 
+@pytest.mark.process
 def test_every_wrong_adjoint_fails_every_check_that_can_see_it(verdicts):
     wrong = {name: verdict for name, verdict in verdicts.items() if name != "nothing"}
     assert len(wrong) >= 15
@@ -121,8 +123,9 @@ def test_every_wrong_adjoint_fails_every_check_that_can_see_it(verdicts):
     assert passed == {}
 
 
+@pytest.mark.process
 def test_kernels_behave_the_same_without_the_jit():
-    done = without_jit("-m", "pytest", "-q", "-p", "no:cacheprovider", "tests/test_mpm.py")
+    done = without_jit("-m", "pytest", "-q", "-p", "no:cacheprovider", "tests/test_kernels.py")
     assert done.returncode == 0, done.stdout
 
 

@@ -9,8 +9,8 @@ import walker
 import weak_particles
 from weak_particles import VOIDS, Void
 
-from mpmopt.binary import distance
-from mpmopt.particles import lay_out
+from mpmopt.assess.threshold import distance
+from mpmopt.scene.particles import discretise
 
 ACTUATION = weak_particles.start_actuation()
 STEP = weak_particles.STEP_IN_CELLS / 64
@@ -20,7 +20,7 @@ STEP = weak_particles.STEP_IN_CELLS / 64
 def drawn():
     """The walker's scene on 64 x 64 cells, a tenth of it in time, and slanted legs."""
     scene = dataclasses.replace(walker.walker(64, STEP), steps=60)
-    particles = lay_out(scene)
+    particles = discretise(scene)
     return scene, walker.slanted_legs(particles.position[particles.designed])
 
 

@@ -1,51 +1,55 @@
 """Breaks the adjoint in many ways and prints, as JSON, what each check says of each.
 
-Run as a program with the JIT switched off: every fault is a changed copy of ``mpm.py`` put in the
-place of the real one.
+Run as a program with the JIT switched off: every fault is a changed file of kernels put in
+the place of the real one.
 """
 
 import json
 import sys
-import types
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 from conftest import small_scene
 
-from mpmopt import actuation, design, mpm, objective, problem, simulate, verify
-from mpmopt.problem import Problem
+from mpmopt import kernels
+from mpmopt.assess import verify
+from mpmopt.design import actuation, chain, objective, problem
+from mpmopt.design.problem import Problem
+from mpmopt.simulation import simulation
 
-# What is replaced in mpm.py, by a name of the fault. Each stands in an adjoint kernel.
+# What is replaced in the kernels, by a name of the fault. Each stands in an adjoint kernel.
 FAULTS = {
     "sign in the weights' slope": ("c + 1) + ty * curvature", "c + 1) - ty * curvature"),
     "slope of the moments": ("(b1 + tx * b2) * b", "(b1 - tx * b2) * b"),
     "bend of the moments": ("(0.375 - 3.0 * hx) * f2", "(0.375 + 3.0 * hx) * f2"),
     "C_bar transposed": (
-        "c0 = pair(number(h, 9 * t + 2, k), number(h, 9 * t + 4, k))",
-        "c0 = pair(number(h, 9 * t + 2, k), number(h, 9 * t + 3, k))",
+        "c0 = pair_of(h, in_tile(t, AFFINE_BAR), in_tile(t, AFFINE_BAR + 2), k)",
+        "c0 = pair_of(h, in_tile(t, AFFINE_BAR), in_tile(t, AFFINE_BAR + 1), k)",
     ),
     "position through the affine momentum": (
         "t, k, q, a0, a1)\n            set",
         "t, k, q, 0.0 * a0, a1)\n            set",
     ),
     "affine momentum transposed": (
-        "gathered, 9 * t + 1, k, along_y[0])",
-        "gathered, 9 * t + 1, k, along_x[1])",
+        "gathered, in_tile(t, AFFINE_BAR + 1), k, along_y[0])",
+        "gathered, in_tile(t, AFFINE_BAR + 1), k, along_x[1])",
     ),
     "mass in the momentum": ("+ u * u_bar + v * v_bar)", ")"),
     "mass of a node": ("-fused(v_bar, v, u_bar * u) * per_m", "-fused(v_bar, v, u_bar * u)"),
-    "step in the velocity": ("v_bar + dt * load(bar, 12 * g + axis)", "v_bar"),
+    "step in the velocity": ("v_bar + dt * x_bar)", "v_bar)"),
     "what the blend keeps": (
-        "store(bar, 12 * g + 2 + axis, world.keep * v_bar)",
-        "store(bar, 12 * g + 2 + axis, none)",
+        "store(bar, at(g, VELOCITY + axis), world.keep * v_bar)",
+        "store(bar, at(g, VELOCITY + axis), none)",
     ),
     "what the blend takes": (
-        "v_bar = pair(-number(bar, 12 * g + 2, k)",
-        "v_bar = pair(number(bar, 12 * g + 2, k)",
+        "-number(bar, at(g, VELOCITY), k)",
+        "number(bar, at(g, VELOCITY), k)",
     ),
     "inertia of the affine velocity": (
-        "m = load(body.mass, g)\n        add(body_bar.mass",
-        "m = 0.0 * load(body.mass, g)\n        add(body_bar.mass",
+        "m = load(body.mass, g)\n    add(body_bar.mass",
+        "m = 0.0 * load(body.mass, g)\n    add(body_bar.mass",
     ),
     "pressure": ("t01 * h10 + pressure * f11", "t01 * h10 - pressure * f11"),
     "shear counted once": ("impulse * (a01 + a10)", "impulse * a01"),
@@ -61,13 +65,28 @@ FAULTS = {
 WALL_FAULT = ("u_bar, v_bar = wall_adjoint(", "u_bar, v_bar = (lambda *args: args[-2:])(")
 
 
-def broken(old: str, new: str) -> types.ModuleType:
-    """A copy of mpm.py with one place changed."""
-    text = Path(mpm.__file__).read_text()
-    assert text.count(old) == 1, f"{text.count(old)} places for {old}"
-    module = types.ModuleType("broken")
-    exec(compile(text.replace(old, new), "broken.py", "exec"), vars(module))
-    return module
+@contextmanager
+def broken(old: str, new: str) -> Iterator[None]:
+    """Kernels of which one place is changed, wherever they are used."""
+    texts = {path: path.read_text() for path in Path(kernels.__file__).parent.glob("*.py")}
+    (path,) = (path for path, text in texts.items() if old in text)
+    assert texts[path].count(old) == 1, f"{texts[path].count(old)} places for {old}"
+    name = f"{kernels.__name__}.{path.stem}"
+    changed = {"__name__": name}
+    exec(compile(texts[path].replace(old, new), "broken.py", "exec"), changed)
+    right = {id(value): key for key, value in vars(sys.modules[name]).items() if callable(value)}
+    users = [m for m in sys.modules.values() if m.__name__.startswith(kernels.__name__)]
+    replaced = [
+        (user, key, value)
+        for user in users
+        for key, value in vars(user).items()
+        if id(value) in right and getattr(value, "__module__", None) == name
+    ]
+    for user, key, value in replaced:
+        setattr(user, key, changed[right[id(value)]])
+    yield
+    for user, key, value in replaced:
+        setattr(user, key, value)
 
 
 def verdicts(scene, x) -> dict[str, bool]:
@@ -91,15 +110,14 @@ def main() -> None:
     x = p.join(rng.uniform(-0.5, 0.5, 8), [0.6, 0.5], [-0.3, 0.2], [-0.5, 0.4])
     result = {"nothing": verdicts(scene, x)}
     for name, fault in {**FAULTS, "wall forgotten": WALL_FAULT}.items():
-        simulate.mpm = verify.mpm = broken(*fault)
-        result[name] = verdicts(scene, x)
-    simulate.mpm = verify.mpm = mpm
+        with broken(*fault):
+            result[name] = verdicts(scene, x)
 
     def scaled(function):
         return lambda *args: tuple(1.001 * bar for bar in function(*args))
 
     for name, module, attribute, wrong in (
-        ("projection", design, "project_adjoint", lambda phi, beta, bar: bar * 0.5),
+        ("projection", chain, "project_adjoint", lambda phi, beta, bar: bar * 0.5),
         (
             "phase",
             actuation,
@@ -108,16 +126,18 @@ def main() -> None:
         ),
         (
             "transient forgotten",
-            simulate.Forward,
+            simulation.Forward,
             "reverse",
-            lambda self, seed, *_, reverse=simulate.Forward.reverse: reverse(self, seed),
+            lambda self, seeds, reverse=simulation.Forward.reverse: reverse(
+                self, {max(seeds): seeds[max(seeds)]}
+            ),
         ),
         (
             "volume in the objective",
             objective.Objective,
-            "seed",
-            lambda self, state, seed=objective.Objective.seed: np.where(
-                np.arange(12)[:, None] < 8, seed(self, state), 0.0
+            "centroid_adjoint",
+            lambda self, state, right=objective.Objective.centroid_adjoint: np.where(
+                np.arange(12)[:, None] < 8, right(self, state), 0.0
             ),
         ),
     ):

@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from mpmopt.mpm import World, ungrouped
-from mpmopt.simulate import Simulation
+from mpmopt.kernels import World, contact, ungrouped
+from mpmopt.simulation.simulation import Simulation
 
 
 def window(simulation: Simulation) -> tuple[NDArray, NDArray]:
@@ -18,14 +18,15 @@ def window(simulation: Simulation) -> tuple[NDArray, NDArray]:
 
 def clamped(world: World) -> tuple[list[int], list[int]]:
     """First and last node along x and y that no wall clamps; only sticking walls are known."""
-    if world.mirror_axis >= 0 or not np.all(np.isinf(world.wall_friction)):
+    if world.mirror_axis >= 0 or not np.all(np.isinf(world.walls[:, contact.FRICTION])):
         raise NotImplementedError("only sticking walls and no mirror planes")
     low, high = [0, 0], [world.nodes_x, world.nodes_y]
-    for axis, side, node in zip(world.wall_axis, world.wall_side, world.wall_node, strict=True):
-        if side > 0:
-            low[axis] = max(low[axis], int(node))
+    for row in world.walls:
+        axis, node = int(row[contact.AXIS]), int(row[contact.NODE])
+        if row[contact.SIDE] > 0:
+            low[axis] = max(low[axis], node)
         else:
-            high[axis] = min(high[axis], int(node))
+            high[axis] = min(high[axis], node)
     return low, high
 
 

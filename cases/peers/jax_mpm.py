@@ -1,4 +1,4 @@
-"""The steps of `mpmopt.mpm` in JAX: a scan of checkpointed steps under jit, differentiated by grad.
+"""The steps of `mpmopt.kernels` in JAX: a scan of checkpointed steps, differentiated by grad.
 
 A step takes particles from one grid to the next, so that positions, deformation gradients and nodes
 are all that the scan carries.
@@ -12,8 +12,8 @@ import numpy as np
 from jax import lax
 from numpy.typing import NDArray
 
-from mpmopt.objective import Objective
-from mpmopt.simulate import Simulation
+from mpmopt.design.objective import Objective
+from mpmopt.simulation.simulation import Simulation
 from peers import clamped, constants, window
 
 jax.config.update("jax_enable_x64", True)

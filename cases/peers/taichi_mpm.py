@@ -1,4 +1,4 @@
-"""The steps of `mpmopt.mpm` in Taichi, differentiated by its kernels' own gradients.
+"""The steps of `mpmopt.kernels` in Taichi, differentiated by its kernels' own gradients.
 
 A kernel takes particles from the grid of one step to that of the next, so that only positions,
 deformation gradients and nodes of all steps are kept.
@@ -11,8 +11,8 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from mpmopt.objective import Objective
-from mpmopt.simulate import Simulation
+from mpmopt.design.objective import Objective
+from mpmopt.simulation.simulation import Simulation
 from peers import clamped, constants, window
 
 NAME = f"Taichi {'.'.join(map(str, ti.__version__))} autodiff"

@@ -1,4 +1,4 @@
-"""The steps of `mpmopt.mpm` in NVIDIA Warp, differentiated by its tape.
+"""The steps of `mpmopt.kernels` in NVIDIA Warp, differentiated by its tape.
 
 A kernel takes particles from the grid of one step to that of the next, so that only positions and
 deformation gradients are kept. Each array of a step has a gradient, but those of all steps share
@@ -6,13 +6,14 @@ one buffer or two, which stay in cache. Launches and tape are captured once and 
 """
 
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from mpmopt.objective import Objective
-from mpmopt.simulate import Simulation
+from mpmopt.design.objective import Objective
+from mpmopt.simulation.simulation import Simulation
 from peers import clamped, constants, window
 
 NAME = f"Warp {wp.__version__} tape"
@@ -21,9 +22,11 @@ wp.config.quiet = True
 flags = wp.config.cpu_compiler_flags or "-march=native"
 wp.set_module_options({"enable_backward": True, "cpu_compiler_flags": f"{flags} -ffast-math"})
 
-real = wp.float64
-vec2, vec4, mat22 = wp.vec2d, wp.vec4d, wp.mat22d
-vec3 = wp.vec3d
+real: TypeAlias = wp.float64
+vec2: TypeAlias = wp.vec2d
+vec3: TypeAlias = wp.vec3d
+vec4: TypeAlias = wp.vec4d
+mat22: TypeAlias = wp.mat22d
 
 
 @wp.struct

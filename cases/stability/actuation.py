@@ -11,11 +11,11 @@ import numpy as np
 from scipy.optimize import brentq
 from walker import slanted_legs
 
-from mpmopt.binary import solid_body
+from mpmopt.assess.threshold import solid_body
+from mpmopt.design.problem import Variables
 from mpmopt.errors import SceneError, SimulationError
-from mpmopt.particles import lay_out
-from mpmopt.problem import Variables
 from mpmopt.scene import Actuator, Grid, Material, Scene
+from mpmopt.scene.particles import discretise
 from stability.common import Found, Line, Measured, Points, at_rest, largest, solid, stretch
 from stability.safe import STRENGTH
 from stability.weak import courant_scene
@@ -44,7 +44,7 @@ def growth_of_a_kick(strength: float, courant: float = 0.3, steps: int = 2000) -
         steps=steps,
         body=(Actuator((12.0, 12.0), (20.0, 20.0), stress=((1.0, 0.0), (0.0, 1.0))),),
     )
-    particles = lay_out(scene)
+    particles = discretise(scene)
     f = equilibrium_stretch(strength)
     state = at_rest(particles)
     state[0:2] = 16.0 + f * (state[0:2] - 16.0)
@@ -97,7 +97,7 @@ def driven(strength: float, courant: float, bias: float = -1.0) -> dict[str, Any
         for part in scene.body
     )
     scene = replace(scene, body=body)
-    particles = lay_out(scene)
+    particles = discretise(scene)
     positions = particles.position[particles.designed] - np.array([16 / 64, 0.0])
     row: dict[str, Any] = {
         "strength": strength, "courant": courant, "bias": bias, "distance": np.nan,
@@ -107,7 +107,7 @@ def driven(strength: float, courant: float, bias: float = -1.0) -> dict[str, Any
     simulation, objective = solid_body(scene, slanted_legs(positions), variables)
     try:
         states = simulation.run([*range(0, scene.steps, 10), scene.steps])
-        row["distance"] = objective.value(states[-1]) - 16 / 64
+        row["distance"] = objective.centroid(states[-1]) - 16 / 64
         row["stretch"] = stretch(states)
     except SimulationError as error:
         row["error"] = str(error)

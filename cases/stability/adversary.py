@@ -5,10 +5,12 @@ from typing import Any
 
 import numpy as np
 
-from mpmopt.binary import THRESHOLD, distance, solid_body
+from mpmopt.assess.threshold import THRESHOLD, distance, solid_body
+from mpmopt.design.problem import Problem
+from mpmopt.design.step_control import LIMITS
 from mpmopt.errors import SimulationError
-from mpmopt.optimize import Settings, Stage, optimise
-from mpmopt.problem import Problem
+from mpmopt.optimisation.loop import optimise
+from mpmopt.optimisation.settings import Settings, Stage
 from mpmopt.scene import Material
 from stability.common import Found, Line, Measured, Points, stretch
 from stability.weak import CASES, HEAVY, SAFE_STIFFNESS, courant_scene
@@ -19,7 +21,7 @@ BETAS = (1, 4, 16)
 
 
 def climb(
-    case: str, mass: float, stiffness: float, courant: float, most: int, redo: int = 0
+    case: str, mass: float, stiffness: float, courant: float, most: int, halvings: int = 0
 ) -> dict[str, Any]:
     """A short optimisation with long moves: what fails, and what is left at half the step.
 
@@ -31,12 +33,22 @@ def climb(
     courant : float
     most : int
         Successful evaluations at each of three sharpnesses.
-    redo : int
-        How often the program may halve the step of an evaluation; 0 shows how many would fail.
+    halvings : int
+        How often the program may halve the step of an evaluation; 0 shows how many would fail,
+        and no limit counts.
     """
-    scene = courant_scene(case, courant, 64, Material(mass_floor=mass, stiffness_floor=stiffness))
+    scene = courant_scene(case, courant, 64, Material(void_density=mass, void_stiffness=stiffness))
     stages = tuple(
-        Stage(beta, mass, stiffness, scene.time_step, move_limit=0.1, redo=redo) for beta in BETAS
+        Stage(
+            beta,
+            mass,
+            stiffness,
+            scene.time_step,
+            move_limit=0.1,
+            halvings=halvings,
+            limited=halvings > 0,
+        )
+        for beta in BETAS
     )
     settings = Settings(stages, least_iterations=most, most_iterations=most)
     run = optimise(scene, settings, Problem(scene).join(0.0, 1.0, -0.3, -0.5))
@@ -45,18 +57,23 @@ def climb(
     block = np.ones(variables.phi.size, dtype=bool)
     reference = distance(problem.scene, block, variables)
     row: dict[str, Any] = {
-        "case": case, "mass_floor": mass, "stiffness_floor": stiffness, "courant": courant,
-        "redo": redo, "evaluations": len(run.history), "failed": run.failed_evaluations,
-        "redone": run.redone_evaluations, "gain": best.objective - reference,
+        "case": case, "void_density": mass, "void_stiffness": stiffness, "courant": courant,
+        "halvings": halvings, "evaluations": len(run.history), "failed": run.failed_evaluations,
+        "halved": run.halved_evaluations, "gain": best.objective - reference,
         "gain_half_step": np.nan, "gain_without_void": np.nan, "stretch_without_void": np.nan,
     }  # fmt: skip
-    half = Problem(problem.scene.vary(time_step=best.time_step / 2.0), BETAS[best.stage], redo=redo)
+    half = Problem(
+        problem.scene.vary(time_step=best.time_step / 2.0),
+        BETAS[best.stage],
+        halvings=halvings,
+        limits=LIMITS if halvings else None,
+    )
     with suppress(SimulationError):
         row["gain_half_step"] = float(half.value(x)) - reference
     simulation, objective = solid_body(problem.scene, best.gamma >= THRESHOLD, variables)
     with suppress(SimulationError):
         states = simulation.run([*range(0, simulation.steps, 10), simulation.steps])
-        row["gain_without_void"] = float(objective.value(states[-1])) - reference
+        row["gain_without_void"] = float(objective.centroid(states[-1])) - reference
         row["stretch_without_void"] = stretch(states)
     return row
 
@@ -68,11 +85,11 @@ def points(quick: bool) -> Points:
         choices = [(floors, courant) for floors in FLOORS for courant in COURANTS]
     climbs = [
         {"case": case, "mass": mass, "stiffness": stiffness, "courant": courant,
-         "most": 6 if quick else 12, "redo": redo}
-        for redo in (0, 2)
+         "most": 6 if quick else 12, "halvings": halvings}
+        for halvings in (0, 2)
         for case in CASES
         for (mass, stiffness), courant in choices
-        if redo == 0 or courant == COURANTS[-1]
+        if halvings == 0 or courant == COURANTS[-1]
     ]  # fmt: skip
     return {climb: climbs}
 
@@ -82,19 +99,19 @@ def measure(measured: Measured) -> Found:
     rows = measured[climb]
     lines = []
     for floors in FLOORS:
-        both = [row for row in rows if (row["mass_floor"], row["stiffness_floor"]) == floors]
-        mine = [row for row in both if row["redo"] == 0]
+        both = [row for row in rows if (row["void_density"], row["void_stiffness"]) == floors]
+        mine = [row for row in both if row["halvings"] == 0]
         if not mine:
             continue
-        failed, redone, of = (
-            sum(row[key] for row in both if row["redo"])
-            for key in ("failed", "redone", "evaluations")
+        failed, halved, of = (
+            sum(row[key] for row in both if row["halvings"])
+            for key in ("failed", "halved", "evaluations")
         )
         program = "SimulationError; the optimiser goes back with half the move limit."
         if of:
             program = (
-                f"Redone with half the step: at Courant {COURANTS[-1]:g} {redone} of {of} are "
-                f"redone and {failed} fail (SimulationError)."
+                f"Redone with half the step: at Courant {COURANTS[-1]:g} {halved} of {of} are "
+                f"halved and {failed} fail (SimulationError)."
             )
         share = ", ".join(
             f"{sum(r['failed'] for r in mine if r['courant'] == c)} of "

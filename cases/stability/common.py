@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpmopt.errors import SimulationError
-from mpmopt.particles import Particles, lay_out
 from mpmopt.scene import Scene
-from mpmopt.simulate import Simulation
+from mpmopt.scene.particles import Particles, discretise
+from mpmopt.simulation.simulation import Simulation
 
 Array = NDArray[np.float64]
 Rows = list[dict[str, Any]]
@@ -68,7 +68,7 @@ def solid(
     time_step : float, optional
         Step that is taken instead of the scene's: one that a scene would refuse.
     """
-    particles = particles or lay_out(scene)
+    particles = particles or discretise(scene)
     ones, material, share = np.ones(len(particles.position)), scene.material, share or {}
     stiffness = share.get("stiffness", ones)
     simulation = Simulation(

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 
 from mpmopt.errors import SimulationError
-from mpmopt.particles import lay_out
 from mpmopt.scene import Grid, Material, Scene, Solid, Wall
+from mpmopt.scene.particles import discretise
 from stability.common import Array, Found, Line, Measured, Points, at_rest, solid
 
 DX = 1.0 / 32.0
@@ -24,7 +24,7 @@ def dropped_block(steps: int, drop: float = 1.0) -> tuple[Array, Array]:
         body=(Solid((8 * DX, (3 + drop) * DX), (16 * DX, (9 + drop) * DX)),),
         walls=(Wall("y", 3 * DX),),
     )
-    particles = lay_out(scene)
+    particles = discretise(scene)
     states = solid(scene, particles).run(range(steps + 1))
     number = np.arange(steps + 1)
     free = particles.position[:, 1].min() - scene.time_step**2 * number * (number + 1) / 2
@@ -71,7 +71,7 @@ def travelled(shape: str, friction: float, slope: float = STEEP, cells: int = 32
         )
 
     first = scene((0.0, normal), settle)
-    particles = lay_out(first)
+    particles = discretise(first)
     if shape == "disc":
         arm = particles.position - np.array([0.40625, floor + 0.15])
         particles = particles.subset(np.hypot(*arm.T) < 0.15)
@@ -104,7 +104,7 @@ def impact(speed: float, courant: float) -> dict[str, Any]:
         body=(Solid((12.0, 12.0), (20.0, 20.0)),),
         walls=(Wall("y", 8.0),),
     )
-    particles = lay_out(scene)
+    particles = discretise(scene)
     state = at_rest(particles)
     state[3] = -speed * wave
     row: dict[str, Any] = {"speed": speed, "courant": courant, "rebound": np.nan, "failure": ""}

@@ -10,11 +10,12 @@ from crawler import crawler
 from exact import Bar
 from walker import walker
 
+from mpmopt.design.problem import Problem
+from mpmopt.design.step_control import LIMITS
 from mpmopt.errors import SimulationError
-from mpmopt.particles import lay_out
-from mpmopt.problem import LIMITS, Problem
 from mpmopt.scene import Actuator, Grid, Material, Scene, Solid, Wall
-from mpmopt.simulate import Precision, Simulation
+from mpmopt.scene.particles import discretise
+from mpmopt.simulation.simulation import Precision, Simulation
 from stability.actuation import equilibrium_stretch
 from stability.common import Found, Line, Measured, Points, at_rest, solid
 from stability.time_step import MOTIONS, block_scene, isolated
@@ -57,14 +58,14 @@ def resolved(quick: bool) -> Iterator[tuple[str, Make]]:
             yield name, partial(grey, drop, blend, precision)
         for name, scene in (("walker", walker(64, 8e-4)), ("crawler", crawler(64, 8e-4))):
             for blend in (0.0, 2e-3):
-                make = partial(grey, scene.vary(mass_floor=1e-2), blend, precision)
+                make = partial(grey, scene.vary(void_density=1e-2), blend, precision)
                 yield f"{name}, grey, blend {blend:g}, {precision}", make
 
 
 def block(courant: float, steps: int, kick: float) -> Simulation:
     """A free block that begins with a small random motion."""
     scene = block_scene(steps=steps)
-    particles = lay_out(scene)
+    particles = discretise(scene)
     state, speed = at_rest(particles), scene.material.wave_speed
     noise = np.random.default_rng(1).uniform(-1.0, 1.0, state[2:8].shape)
     state[2:8] = kick * speed * noise
@@ -88,7 +89,7 @@ def pushing(strength: float, steps: int) -> Simulation:
         steps=steps,
         body=(Actuator((12.0, 12.0), (20.0, 20.0), stress=((1.0, 0.0), (0.0, 1.0))),),
     )
-    particles = lay_out(scene)
+    particles = discretise(scene)
     state, f = at_rest(particles), equilibrium_stretch(strength)
     state[0:2] = 16.0 + f * (state[0:2] - 16.0)
     state[[8, 11]] = f
@@ -100,7 +101,7 @@ def pushing(strength: float, steps: int) -> Simulation:
 
 def light_void(case: str, seed: int) -> Simulation:
     """A random design at Courant 0.8 whose void weighs 1e-5 of the solid."""
-    scene = courant_scene(case, 0.8, 64, Material(mass_floor=1e-5, stiffness_floor=1e-5))
+    scene = courant_scene(case, 0.8, 64, Material(void_density=1e-5, void_stiffness=1e-5))
     problem = Problem(scene, 16.0)
     phi = np.random.default_rng(seed).uniform(-1.0, 1.0, problem.size - 3)
     return problem.simulation(problem.join(phi, 1.0, -0.3, -0.5))
@@ -135,8 +136,12 @@ def balance(kind: str, case: str) -> dict[str, Any]:
     row: dict[str, Any] = {"kind": kind, "case": case, "courant": np.nan, "spin": np.nan,
                            "energy": np.nan, "error": ""}  # fmt: skip
     try:
-        margins = make().watch().margins
-        return row | {key: getattr(margins, key) for key in ("courant", "spin", "energy")}
+        indicators = make().watch().indicators
+        return row | {
+            "courant": indicators.courant,
+            "spin": indicators.velocity_increment,
+            "energy": indicators.energy,
+        }
     except SimulationError as error:
         return row | {"error": error.what}
 

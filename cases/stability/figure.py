@@ -38,7 +38,8 @@ def groups(rows: Rows, *keys: str) -> dict[tuple, Rows]:
 
 def note(axes: Axes, x: float, y: float, text: str, **more: Any) -> None:
     """A small remark."""
-    axes.annotate(text, (x, y), **{"fontsize": 7, "color": "0.25"} | more)
+    style: dict[str, Any] = {"fontsize": 7, "color": "0.25"}
+    axes.annotate(text, (x, y), **(style | more))
 
 
 def rest(axes: Axes, tables: Tables) -> None:
@@ -78,20 +79,22 @@ def motion(axes: Axes, tables: Tables) -> None:
 
 
 def weak(heavy: bool) -> Callable[[Axes, Tables], None]:
-    """Heat map of what void does, for equal floors or for a heavy mass floor."""
+    """Heat map of what void does, for equal floors or for a heavy void density."""
 
     def draw(axes: Axes, tables: Tables) -> None:
         rows = [
             row
             for row in tables["weak"]
             if (
-                row["mass_floor"] == HEAVY if heavy else row["mass_floor"] == row["stiffness_floor"]
+                row["void_density"] == HEAVY
+                if heavy
+                else row["void_density"] == row["void_stiffness"]
             )
         ]
-        epsilons = sorted({row["stiffness_floor"] for row in tables["weak"]}, reverse=True)
+        epsilons = sorted({row["void_stiffness"] for row in tables["weak"]}, reverse=True)
         courants = sorted({row["courant"] for row in rows})
         colour = np.full((len(epsilons), len(courants)), np.nan)
-        for (epsilon, courant), both in groups(rows, "stiffness_floor", "courant").items():
+        for (epsilon, courant), both in groups(rows, "void_stiffness", "courant").items():
             i, j = epsilons.index(epsilon), courants.index(courant)
             if any(row["refused"] for row in both):
                 axes.add_patch(Rectangle((j - 0.5, i - 0.5), 1, 1, fc="0.9", ec="0.6", hatch="///"))
@@ -110,8 +113,8 @@ def weak(heavy: bool) -> Callable[[Axes, Tables], None]:
         axes.set_xticks(range(len(courants)), [f"{c:g}" for c in courants], fontsize=7)
         axes.set_yticks(range(len(epsilons)), [f"{e:.0e}" for e in epsilons], fontsize=7)
         axes.set_xlabel("Courant number")
-        axes.set_ylabel("stiffness floor")
-        what = f"mass floor {HEAVY:g}" if heavy else "same mass floor"
+        axes.set_ylabel("void stiffness")
+        what = f"void density {HEAVY:g}" if heavy else "same void density"
         axes.set_title(f"Void beside solid, {what} (n/m failed)")
         bar = axes.figure.colorbar(image, ax=axes, pad=0.02)
         bar.set_label("void moves L by", fontsize=7)
@@ -165,7 +168,10 @@ def fracture(axes: Axes, tables: Tables) -> None:
 def vortex(axes: Axes, tables: Tables) -> None:
     """Errors of the vortex over its greatest stretch."""
     for (cells, courant), rows in groups(tables["vortex"], "cells", "courant").items():
-        style = {"ls": "-" if courant == 0.4 else ":", "color": f"C{(24, 48, 96).index(cells)}"}
+        style: dict[str, Any] = {
+            "ls": "-" if courant == 0.4 else ":",
+            "color": f"C{(24, 48, 96).index(cells)}",
+        }
         axes.loglog(
             column(rows, "stretch"), column(rows, "error"), marker=".", lw=1,
             label=f"{cells} cells, Courant {courant:g}", **style,
@@ -210,8 +216,8 @@ def incline(axes: Axes, tables: Tables) -> None:
 
 def adversary(axes: Axes, tables: Tables) -> None:
     """Share of evaluations that fail while a walker or crawler is optimised."""
-    rows = [row for row in tables["adversary"] if row["redo"] == 0]
-    by_floors = groups(rows, "mass_floor", "stiffness_floor")
+    rows = [row for row in tables["adversary"] if row["halvings"] == 0]
+    by_floors = groups(rows, "void_density", "void_stiffness")
     courants = sorted({row["courant"] for row in rows})
     width = 0.8 / len(by_floors)
     for number, ((mass, stiffness), some) in enumerate(by_floors.items()):

@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 
 from mpmopt.errors import SimulationError
-from mpmopt.particles import lay_out
 from mpmopt.scene import Grid, Material, Scene, Solid
+from mpmopt.scene.particles import discretise
 from stability.common import Array, Found, Line, Measured, Points, at_rest, solid, stretch
 
 STRETCHES = (1.0 + 1e-6, 1.25, 1.5, 1.75, 2.0, 2.25, 2.5, 3.0, 3.5, 4.0, 5.0, 6.0, 7.0, 8.0)
@@ -36,7 +36,7 @@ def transmitted_force(factor: float, offset: float, per_cell: int = 2) -> float:
         body=(Solid((2.0, 4.0), (2.0 + 2 * half, 12.0)),),
         particles_per_cell=per_cell,
     )
-    particles = lay_out(scene)
+    particles = discretise(scene)
     state = at_rest(particles)
     middle = round(cells / 2) + offset
     state[0] = middle + factor * (state[0] - 2.0 - half)
@@ -85,7 +85,7 @@ def pulled_bar(speed: float, per_cell: int, courant: float = 0.3) -> tuple[Array
         body=(Solid((40.0, 4.0), (56.0, 8.0)),),
         particles_per_cell=per_cell,
     )
-    particles = lay_out(scene)
+    particles = discretise(scene)
     state = at_rest(particles)
     state[2] = speed * wave * (state[0] - 48.0) / 8.0
     state[4] = speed * wave / 8.0
@@ -117,7 +117,7 @@ def thrown(speed: float, courant: float = 0.3) -> tuple[int, int, str]:
         steps=10000,
         body=(Solid((4.0, 4.0), (8.0, 8.0)),),
     )
-    particles = lay_out(scene)
+    particles = discretise(scene)
     state = at_rest(particles)
     state[2] = speed * scene.material.wave_speed
     way = 23.5 - particles.position[:, 0].max()
@@ -177,7 +177,7 @@ def measure(measured: Measured) -> Found:
             f"weakest cut carries {cuts[2, 2.0]:.0%}, {cuts[2, 3.0]:.0%}, {abs(cuts[2, 4.0]):.0%} "
             f"at stretch 2, 3, 4 ({cuts[3, 3.0]:.0%} and {abs(cuts[3, 6.0]):.0%} at 3 and 6); a "
             f"pulled bar tears from {torn[2]:g} ({torn[3]:g}) c_p on",
-            "A simulation runs on, **and is wrong**; `Problem` ends in a TornError beyond 1.5 "
+            "A simulation runs on, **and is wrong**; `Problem` ends in a FractureError beyond 1.5 "
             "times one particle a cell, and bodies without void beyond one.",
         )
     )

@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 from walker import slanted_legs, walker
 
-from mpmopt.problem import Problem
+from mpmopt.assess.verify import contact_free
+from mpmopt.design.problem import Problem
 from mpmopt.scene import Scene
-from mpmopt.simulate import Precision
-from mpmopt.verify import contact_free
+from mpmopt.simulation.simulation import Precision
 from stability.common import Array, Found, Line, Measured, Points
 
 HORIZONS = (25, 50, 100, 200, 400, 800, 1250, 2500, 5000)
@@ -18,15 +18,15 @@ ONE_PERCENT = 0.01
 
 
 def scene_of(steps: int, contact: bool) -> Scene:
-    """The first steps of the preview's walker with a heavy mass floor, or of it without a floor."""
+    """The first steps of the preview's walker with heavy void, or of it without a floor."""
     scene = walker(64, 8e-4)
-    scene = replace(scene, steps=steps, material=replace(scene.material, mass_floor=1e-2))
+    scene = replace(scene, steps=steps, material=replace(scene.material, void_density=1e-2))
     return scene if contact else contact_free(scene, steps)
 
 
 def plain(scene: Scene, precision: Precision = "double") -> Problem:
     """A problem at beta = 4 that is evaluated in its own time step and in no other."""
-    return Problem(scene, beta=4.0, precision=precision, redo=0)
+    return Problem(scene, beta=4.0, precision=precision, halvings=0, limits=None)
 
 
 def design(problem: Problem) -> Array:

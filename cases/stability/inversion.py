@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 
 from mpmopt.errors import SimulationError
-from mpmopt.particles import lay_out
 from mpmopt.scene import Grid, Material, Scene, Solid
+from mpmopt.scene.particles import discretise
 from stability.common import Array, Found, Line, Measured, Points, at_rest, solid
 
 AMPLITUDES = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.7, 1.0)
@@ -34,7 +34,7 @@ def vortex(amplitude: float, cells: int, duration: float = 1.0, courant: float =
         material=RING,
         body=(Solid((2 * dx, 2 * dx), (3.0 - 2 * dx, 3.0 - 2 * dx)),),
     )
-    everything = lay_out(scene)
+    everything = discretise(scene)
     # The solution has no displacement at the edges: a rim of two cells holds them.
     off = np.abs(np.hypot(*(everything.position - CENTRE).T) - 1.0)
     ring = everything.subset(off < 0.25 + 2.0 * dx)
@@ -92,8 +92,8 @@ def vortex(amplitude: float, cells: int, duration: float = 1.0, courant: float =
             ) from error
         state[:, rim] = held
         outwards, _, _ = rotated((step + 1) * dt)
-        error = (state[0:2] - CENTRE - R * outwards)[:, moved]
-        worst = max(worst, float(np.sqrt((error**2).sum(axis=0).mean())))
+        miss = (state[0:2] - CENTRE - R * outwards)[:, moved]
+        worst = max(worst, float(np.sqrt((miss**2).sum(axis=0).mean())))
     return worst / amplitude
 
 

@@ -4,8 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from mpmopt.design import project, project_adjoint
-from mpmopt.mma import MMAError, MovingAsymptotes
+from mpmopt.design.chain import project, project_adjoint
+from mpmopt.optimisation.mma import MMAError, MovingAsymptotes
 from stability.common import Found, Line, Measured, Points
 
 LEAST_DISTANCES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)
@@ -31,7 +31,7 @@ def change_by_scale(scale: float) -> float:
         optimiser = MovingAsymptotes(-np.ones(7), np.ones(7), move_limit=0.2)
         x, points = np.zeros(7), []
         for _ in range(30):
-            f, slope = weight @ (x - target) ** 4, 4.0 * weight * (x - target) ** 3
+            f, slope = float(weight @ (x - target) ** 4), 4.0 * weight * (x - target) ** 3
             x = optimiser.step(x, by * f, by * slope)
             points.append(x)
         return np.array(points)

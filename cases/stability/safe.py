@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
+from mpmopt.design.problem import Problem
 from mpmopt.errors import SimulationError
-from mpmopt.problem import Problem
 from mpmopt.scene import Actuator, Material, Scene
 from stability.common import Found, Line, Measured, Points, stretch
 from stability.time_step import SAFE_COURANT
@@ -14,7 +14,7 @@ from stability.weak import CASES, actuation, courant_scene
 
 # The corner of the region where it is most likely to fail.
 STRENGTH = 0.6
-MATERIAL = Material(mass_floor=1e-2, stiffness_floor=1e-3)
+MATERIAL = Material(void_density=1e-2, void_stiffness=1e-3)
 BETAS = (2.0, 32.0)
 
 
@@ -49,7 +49,7 @@ def at_random(case: str, beta: float, seed: int, cells: int = 64) -> dict[str, A
             states = simulation.run([*range(0, scene.steps, 20), scene.steps])
         except SimulationError as error:
             return row | {"error": str(error)}
-        row[key] = float(problem.objective(simulation).value(states[-1]))
+        row[key] = float(problem.objective(simulation).centroid(states[-1]))
         if key == "distance":
             solid = np.ones(states.shape[2], dtype=bool)
             solid[problem.particles.designed] = problem.gamma(x) >= 0.5

@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 import scipy.linalg
 
-from mpmopt import mpm
+from mpmopt import kernels
 from mpmopt.errors import SceneError, SimulationError
-from mpmopt.particles import Particles, lay_out
 from mpmopt.scene import Grid, Scene, Solid
+from mpmopt.scene.particles import Particles, discretise
 from stability.common import (
     Array,
     Found,
@@ -61,13 +61,13 @@ def linear_limit(
     """
     rows = period or int(position.max()) + 3
     long = 10**4
-    nodes, weight = mpm.interpolation(position, 1.0, long)
+    nodes, weight = kernels.interpolation(position, 1.0, long)
     column, row = np.divmod(nodes, long)
     arm = np.stack([column - position[:, :1], row - position[:, 1:]], axis=-1)
     node = column % rows * rows + row % rows
     count = rows * rows
     lumped, shared = np.zeros(count), np.zeros((count, count))
-    K = np.zeros((count, 2, count, 2))
+    K, both = np.zeros((count, 2, count, 2)), np.arange(2)
     one = np.eye(2)
     for p, here in enumerate(node):
         pair, dot = np.outer(weight[p], weight[p]), arm[p] @ arm[p].T
@@ -78,13 +78,13 @@ def linear_limit(
             + np.einsum("ib,ja->iajb", arm[p], arm[p])
             + np.einsum("ia,jb->iajb", arm[p], arm[p])
         )
-        K[np.ix_(here, (0, 1), here, (0, 1))] += (
+        K[np.ix_(here, both, here, both)] += (
             16.0 * volume[p] * stiffness[p] * pair[:, None, :, None] * tangent
         )
     there = np.flatnonzero(lumped > 0.0)
-    K = K[np.ix_(there, (0, 1), there, (0, 1))].reshape(2 * there.size, -1)
+    stiff = K[np.ix_(there, both, there, both)].reshape(2 * there.size, -1)
     inertia = np.diag(lumped[there]) + shared[np.ix_(there, there)]
-    greatest = scipy.linalg.eigh(K, np.kron(inertia, one), eigvals_only=True)[-1]
+    greatest = scipy.linalg.eigh(stiff, np.kron(inertia, one), eigvals_only=True)[-1]
     return float(np.sqrt(3.0) * np.sqrt(2.0 / greatest))  # c_p = sqrt(3) for lambda = mu = rho = 1
 
 
@@ -104,7 +104,7 @@ def stays_small(scene: Scene, particles: Particles, mass: Array, courant: float)
 
 def isolated(scene: Scene) -> Particles:
     """One particle of the scene's body."""
-    return lay_out(scene).subset(np.arange(len(lay_out(scene).position)) == 0)
+    return discretise(scene).subset(np.arange(len(discretise(scene).position)) == 0)
 
 
 def shifted(particles: Particles, by: float) -> Particles:
@@ -128,15 +128,15 @@ def resting_limit(body: str, steps: int, shift: float = 0.0) -> dict[str, Any]:
     if body == "bulk":
         # A rim four times as heavy moves slowly and leaves what lies inside to itself.
         scene = block_scene(14, steps)
-        particles = lay_out(scene)
+        particles = discretise(scene)
         rim = np.any(np.abs(particles.position - CELLS / 2) > 4.0, axis=1)
         mass = np.where(rim, 4.0, 1.0)
-        patch = lay_out(block_scene(6)).position
+        patch = discretise(block_scene(6)).position
         ones = np.ones(len(patch))
         theory = linear_limit(patch, ones, ones, ones, period=6)
     else:
         scene = block_scene(steps=steps)
-        block = shifted(lay_out(scene), shift)
+        block = shifted(discretise(scene), shift)
         particles = isolated(scene) if body == "isolated particle" else block
         mass = ones = np.ones(len(particles.position))
         theory = linear_limit(particles.position, ones, ones, ones)

@@ -8,21 +8,21 @@ import numpy as np
 from crawler import crawler
 from walker import walker
 
-from mpmopt.actuation import signal
-from mpmopt.binary import distance
-from mpmopt.design import interpolate
+from mpmopt.assess.threshold import distance
+from mpmopt.design.actuation import signal
+from mpmopt.design.chain import interpolate
+from mpmopt.design.objective import Objective
+from mpmopt.design.problem import Variables
 from mpmopt.errors import SceneError, SimulationError
-from mpmopt.objective import Objective
-from mpmopt.particles import lay_out
-from mpmopt.problem import Variables
 from mpmopt.scene import Grid, Material, Scene
-from mpmopt.simulate import Simulation
+from mpmopt.scene.particles import discretise
+from mpmopt.simulation.simulation import Simulation
 from stability.common import Array, Found, Line, Measured, Points
 from stability.time_step import block_scene, linear_limit
 
 EPSILONS = tuple(10.0**-k for k in range(1, 7))
 COURANTS = (0.14, 0.25, 0.35, 0.5, 0.6, 0.7, 0.8)
-HEAVY = 1e-2  # the mass floor that is the cure
+HEAVY = 1e-2  # the void density that is the cure
 SAFE_STIFFNESS = 1e-3
 GAIN = 0.25  # of an optimised walker: deviations are judged by it
 
@@ -72,17 +72,17 @@ def with_void(scene: Scene, there: np.ndarray, variables: Variables) -> float:
     SimulationError
         If the simulation fails.
     """
-    particles = lay_out(scene)
+    particles = discretise(scene)
     gamma = np.ones(len(particles.position))
     gamma[particles.designed] = there
     given = signal(scene, variables.a, variables.theta, variables.b)
     simulation = Simulation(scene, particles, *interpolate(scene.material, gamma), given)
-    return float(Objective.of(particles, scene.direction).value(simulation.run()))
+    return float(Objective.of(scene, particles).centroid(simulation.run()))
 
 
 def floors(epsilon: float, heavy: bool) -> Material:
     """Both floors equal, or a heavy one for mass."""
-    return Material(stiffness_floor=epsilon, mass_floor=HEAVY if heavy else epsilon)
+    return Material(void_stiffness=epsilon, void_density=HEAVY if heavy else epsilon)
 
 
 def limit_at_rest(material: Material) -> float:
@@ -90,10 +90,10 @@ def limit_at_rest(material: Material) -> float:
 
     Void is a frame one cell wide. The worst of several places between the nodes.
     """
-    position = lay_out(block_scene(8)).position
+    position = discretise(block_scene(8)).position
     void = np.any(np.abs(position - 12.0) > 3.0, axis=1)
-    mass = np.where(void, material.mass_floor, 1.0)
-    stiffness = np.where(void, material.stiffness_floor, 1.0)
+    mass = np.where(void, material.void_density, 1.0)
+    stiffness = np.where(void, material.void_stiffness, 1.0)
     ones = np.ones(len(position))
     return min(linear_limit(position + shift, mass, ones, stiffness) for shift in (0.0, 0.25, 0.5))
 
@@ -104,15 +104,15 @@ def one_square(
     """Random designs with void, each against the same body without it."""
     material = floors(epsilon, heavy)
     row: dict[str, Any] = {
-        "case": case, "courant": courant, "stiffness_floor": material.stiffness_floor,
-        "mass_floor": material.mass_floor, "refused": False, "designs": 0, "failed": 0,
+        "case": case, "courant": courant, "void_stiffness": material.void_stiffness,
+        "void_density": material.void_density, "refused": False, "designs": 0, "failed": 0,
         "median_deviation": np.nan, "largest_deviation": np.nan, "error": "",
     }  # fmt: skip
     try:
         scene = courant_scene(case, courant, material=material)
     except SceneError as error:
         return row | {"refused": True, "error": str(error)}
-    particles = lay_out(scene)
+    particles = discretise(scene)
     away = []
     for seed in range(designs):
         there, variables = patches(particles.position[particles.designed], seed), actuation(seed)
@@ -143,12 +143,12 @@ def points(quick: bool) -> Points:
 
 
 def measure(measured: Measured) -> Found:
-    """The map, and how it sums up for equal floors and for a heavy mass floor."""
+    """The map, and how it sums up for equal floors and for a heavy void density."""
     rows = measured[one_square]
     lines = []
     for heavy in (False, True):
-        mine = [r for r in rows if (r["mass_floor"] == HEAVY) is heavy or not heavy]
-        mine = [r for r in mine if heavy or r["mass_floor"] == r["stiffness_floor"]]
+        mine = [r for r in rows if (r["void_density"] == HEAVY) is heavy or not heavy]
+        mine = [r for r in mine if heavy or r["void_density"] == r["void_stiffness"]]
         ran = [r for r in mine if not r["refused"]]
         failed = [r for r in ran if r["failed"]]
         runs = sum(r["designs"] for r in ran)
@@ -157,19 +157,19 @@ def measure(measured: Measured) -> Found:
         ]
         theory = f"linearised step at rest: {min(at_rest_limits):.2f} to {max(at_rest_limits):.2f}"
         if failed:
-            first = min(failed, key=lambda r: (r["courant"], -r["stiffness_floor"]))
+            first = min(failed, key=lambda r: (r["courant"], -r["void_stiffness"]))
             said = (
                 f"{sum(r['failed'] for r in failed)} of {runs} runs fail, the first at Courant "
-                f"{first['courant']:g} with floors of {first['stiffness_floor']:.0e}"
+                f"{first['courant']:g} with floors of {first['void_stiffness']:.0e}"
             )
         else:
             said = f"0 of {runs} runs fail, up to Courant {max(r['courant'] for r in ran):g}"
-        weak = [r["largest_deviation"] for r in ran if r["stiffness_floor"] <= SAFE_STIFFNESS]
+        weak = [r["largest_deviation"] for r in ran if r["void_stiffness"] <= SAFE_STIFFNESS]
         said += (
             f"; with floors of {SAFE_STIFFNESS:g} or less void moves the objective by at most "
             f"{np.nanmax(weak):.4f}"
         )
-        name = f"mass floor {HEAVY:g}" if heavy else "floors of mass and stiffness equal"
+        name = f"void density {HEAVY:g}" if heavy else "floors of mass and stiffness equal"
         refused = sum(r["refused"] for r in mine)
         program = "SimulationError: inverted, or left the grid." if failed else ""
         if refused:

@@ -2,7 +2,9 @@
 
 import sys
 
-from mpmopt.case import Case, main, sharpened
+from mpmopt.app.case import Case
+from mpmopt.app.script import main
+from mpmopt.optimisation.presets import continuation
 from mpmopt.scene import Actuator, Design, Grid, Scene, Wall
 
 c = 1 / 64  # width of a cell
@@ -25,7 +27,7 @@ def all_there(positions):
     return positions[:, 0] > 0.0
 
 
-CASE = Case(worm, sharpened(8e-4), all_there)
+CASE = Case(worm, continuation(8e-4), all_there)
 
 if __name__ == "__main__":
     sys.exit(main("A worm.", {"default": CASE}))

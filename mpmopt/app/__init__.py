@@ -1,0 +1,1 @@
+"""Cases, several starts, sweeps: what scripts and commands do."""

@@ -1,0 +1,265 @@
+"""One case from start to end: optimise, judge, and leave a folder of results."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpmopt.app.summary import summarise
+from mpmopt.assess.threshold import Baseline
+from mpmopt.design.problem import Problem, Variables
+from mpmopt.errors import DesignError, RunFileError, StorageError
+from mpmopt.io.console import say
+from mpmopt.io.files import locked, make_folder, refuse_existing, replace_file
+from mpmopt.io.progress import Progress
+from mpmopt.optimisation.history import Optimisation
+from mpmopt.optimisation.loop import HOW, begin, check_body_fits, go_on
+from mpmopt.optimisation.settings import Settings
+from mpmopt.results import runfile
+from mpmopt.scene import Scene
+from mpmopt.scene.particles import discretise
+from mpmopt.simulation.checkpoints import Checkpointing
+from mpmopt.validation import digits, instance, place, shown
+
+logger = logging.getLogger(__name__)
+
+RESULTS = ("summary.json", "design.png", "history.png")  # besides run.h5
+START = {"phi": 0.0, "a": 1.0, "theta": -0.3, "b": -0.5}
+QUARTER_TURNS = (0.0, 0.5, 1.0, -0.5)  # of theta, for the starts that scout
+
+
+@dataclass(frozen=True)
+class Case:
+    """A scene, how to optimise it, and what an engineer would draw instead.
+
+    Attributes
+    ----------
+    scene : Scene
+    settings : Settings
+    drawing : callable
+        From positions (D, 2) of the design particles to which are there (D,): a second reference
+        design besides the full block.
+    start : mapping, optional
+        First phi, a, theta and b, as `Problem.join` takes them: one number for all actuators, or
+        one for each. What is left out is that of `START`.
+
+    Raises
+    ------
+    DesignError
+        If the start has another name in it, or anything is of another kind.
+    """
+
+    scene: Scene
+    settings: Settings
+    drawing: Baseline
+    start: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        instance("Case", "scene", self.scene, Scene)
+        instance("Case", "settings", self.settings, Settings, HOW)
+        instance("Case", "start", self.start, Mapping)
+        if not callable(self.drawing):
+            raise DesignError(
+                f"Case: drawing = {shown(self.drawing)} must be a function of positions (D, 2), "
+                "such as binary.solid_reference"
+            )
+        if unknown := set(self.start) - set(START):
+            raise DesignError(
+                f"Case: start has {', '.join(unknown)}; its names are {', '.join(START)}"
+            )
+        object.__setattr__(self, "start", {**START, **self.start})
+
+
+class ProgressBar:
+    """Callback of `optimise` that shows how far it is; log lines off a terminal."""
+
+    def __init__(self) -> None:
+        self._progress = Progress("gradients")
+
+    def __call__(self, run: Optimisation) -> None:
+        self._progress.count = len(run.history) - 1
+        if run.stop_reason:
+            self._progress.close()
+            return
+        last = run.history[-1]
+        self._progress.step(
+            f"L {digits(last.objective)}, beta {last.beta:g}, "
+            f"non-discreteness {last.non_discreteness:.3f}"
+        )
+
+
+def run(
+    case: Case,
+    out: str | os.PathLike[str],
+    checkpointing: Checkpointing | None = None,
+    force: bool = False,
+    phi: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None,
+) -> dict[str, Any]:
+    """Optimise a case and leave its results in a folder.
+
+    Writes ``run.h5`` (before the first and after every evaluation), ``summary.json``,
+    ``design.png`` and ``history.png``. A folder that holds an unfinished run of this case is gone
+    on with; one that holds a finished one is left as it is.
+
+    Parameters
+    ----------
+    case : Case
+    out : str or path
+        Folder, made if it is not there.
+    checkpointing : Checkpointing, optional
+    force : bool, optional
+        Begin anew and replace whatever the folder holds under those names.
+    phi : callable, optional
+        Of positions (D, 2): phi (D,) that a run begins with, instead of the case's.
+
+    Returns
+    -------
+    dict
+        The summary.
+
+    Raises
+    ------
+    DesignError
+        If the drawing is none (`drawn`); it is looked at before anything is written.
+    StorageError
+        If the folder cannot be made, holds another case's run or files of those names without a
+        run, or another process is at work in it.
+    MpmoptError
+        As `optimise` does.
+    """
+    instance("run", "case", case, Case)
+    path = Path(os.path.realpath(place("run", "out", out) / "run.h5"))
+    folder = path.parent
+    first = case.settings.stages[0]
+    problem = Problem(first.scene(case.scene), first.beta, checkpointing)
+    turns = QUARTER_TURNS if case.settings.scouting else (0.0,)
+    position = problem.particles.position[problem.particles.designed]
+    if phi is not None and not callable(phi):
+        raise DesignError(f"run: phi = {shown(phi)} must be a function of positions (D, 2)")
+    plain = case.start if phi is None else {**case.start, "phi": phi(position)}
+    parts = Variables.of(problem.join(**plain), len(position))
+    starts = [problem.join(*parts._replace(theta=_turned(parts.theta, turn))) for turn in turns]
+    check_body_fits(case.scene)
+    new, drawing = begin(case.scene, case.settings, starts), drawn(case)
+    make_folder(folder)
+    with locked(path):
+        if path.exists() and not force:
+            try:
+                kept = runfile.read_run(path)
+            except RunFileError as error:
+                raise RunFileError(
+                    f"{error}; choose another folder, or --force to replace it"
+                ) from error
+            begun = kept.run.first.x if kept.run.first else kept.run.legs[0].x
+            same = (kept.run.scene, kept.run.settings) == (case.scene, case.settings)
+            if not same or not np.array_equal(begun, starts[0]):
+                raise StorageError(
+                    f"{path} holds an earlier run of another case; choose another folder, or "
+                    "--force to replace it"
+                )
+            return _go_on(path, kept, checkpointing)
+        refuse_existing((folder / name for name in RESULTS), force)
+        runfile.write(path, new, drawing=drawing)
+        return _go_on(path, runfile.read_run(path), checkpointing)
+
+
+def resume(
+    path: str | os.PathLike[str], checkpointing: Checkpointing | None = None
+) -> dict[str, Any]:
+    """Go on with the run of a run file to the end that it would have had without a stop.
+
+    Returns
+    -------
+    dict
+        The summary, also of a run that was finished already.
+
+    Raises
+    ------
+    RunFileError
+        If there is no run file, or it is damaged.
+    StorageError
+        If another process is at work on it.
+    MpmoptError
+        As `optimise` does.
+    """
+    # A link would be replaced, not what it leads to.
+    path = Path(os.path.realpath(place("resume", "path", path)))
+    with locked(path):
+        return _go_on(path, runfile.read_run(path), checkpointing)
+
+
+def drawn(case: Case) -> dict[int, NDArray[np.bool_]]:
+    """Which design particles the case's drawing has, for each coarsening of its stages.
+
+    Raises
+    ------
+    DesignError
+        If it does not give (D,) of True and False.
+    """
+    there = {}
+    for coarsening, stage in {stage.coarsening: stage for stage in case.settings.stages}.items():
+        particles = discretise(stage.scene(case.scene))
+        position = particles.position[particles.designed]
+        array, shape = np.asarray(case.drawing(position), dtype=object), (len(position),)
+        kinds = {type(value).__name__ for value in array.ravel().tolist()}
+        if array.shape != shape or not kinds <= {"bool", "bool_"}:
+            raise DesignError(
+                f"Case: drawing gave {', '.join(sorted(kinds))} of shape {array.shape} for "
+                f"positions of shape {position.shape}, must give bool of shape {shape}: whether "
+                "each particle is there"
+            )
+        there[coarsening] = array.astype(bool)
+    return there
+
+
+def _go_on(
+    path: Path, kept: runfile.RunFile, checkpointing: Checkpointing | None
+) -> dict[str, Any]:
+    if kept.summary:
+        say(f"{path} holds a finished run.")
+        return kept.summary
+    if kept.versions != runfile.versions():
+        logger.warning("%s was begun with %s: digits may differ", path, kept.versions)
+    if kept.run.history:
+        say(f"Going on after {len(kept.run.history)} evaluations.")
+
+    def save(current: Optimisation) -> None:
+        runfile.write(path, current, drawing=kept.drawing)
+
+    result = go_on(kept.run, [save, ProgressBar()], checkpointing)
+    summary = summarise(result, kept.drawing)
+    text = json.dumps(summary, indent=1) + "\n"
+    replace_file(path.parent / "summary.json", text.encode())
+    runfile.write(path, result, summary, kept.drawing)
+    for name in RESULTS[1:]:
+        draw_or_warn(path.parent / name, lambda picture: _draw(picture, result))
+    return summary
+
+
+def _turned(theta: NDArray[np.float64], turn: float) -> NDArray[np.float64]:
+    """Theta and a turn, within [-1, 1]."""
+    theta = theta + turn
+    return np.where(np.abs(theta) > 1.0, theta - 2.0 * np.sign(theta), theta)
+
+
+def _draw(path: Path, result: Optimisation) -> None:
+    from mpmopt.view.plot import PICTURES
+
+    PICTURES[path.stem](path, result)
+
+
+def draw_or_warn(path: Path, draw: Callable[[Path], None]) -> None:
+    """Draw a picture of what is saved; one that fails is a warning of one line."""
+    try:
+        draw(path)
+    except Exception as error:
+        reason = (str(error).splitlines() or [""])[0]
+        logger.warning("no %s: %s: %s", path.name, type(error).__name__, reason)

@@ -1,0 +1,112 @@
+"""What a finished run reached, in numbers."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpmopt.assess import threshold
+from mpmopt.assess.refinement import audit
+from mpmopt.assess.threshold import farthest, pieces, post_processed, solid_reference, unactuated
+from mpmopt.design.problem import Variables
+from mpmopt.errors import SimulationError
+from mpmopt.optimisation.history import Optimisation
+from mpmopt.validation import digits, instance
+
+logger = logging.getLogger(__name__)
+
+
+def summarise(result: Optimisation, drawing: Mapping[int, NDArray[np.bool_]]) -> dict[str, Any]:
+    """Objective values (L, larger is farther), actuation and counts of a finished optimisation.
+
+    The drawing is that of `drawn`, or empty.
+
+    Reference designs count with the better of the first and the best design's actuation.
+    """
+    instance("summarise", "result", result, Optimisation)
+    best, problem = result.result, result.problem()
+    _, *others = audits = audit(problem, best.x)
+    first = result.first
+    assert first is not None
+    there = drawing.get(result.settings.stages[best.stage].coarsening)
+    actuations = [Variables.of(item.x, item.gamma.size) for item in (first, best)]
+    actuation = actuations[1]
+    reference = _value_or_none(lambda: farthest(problem.scene, solid_reference, *actuations))
+    block = np.nan if reference is None else reference
+
+    def numbers(values: np.ndarray) -> float | list[float]:
+        return float(values[0]) if values.size == 1 else values.tolist()
+
+    return {
+        "start": _value_or_none(lambda: first.objective),
+        "reference": reference,
+        "reference_drawn": None
+        if there is None
+        else _value_or_none(lambda: farthest(problem.scene, lambda _: there, *actuations)),
+        "optimised": best.objective,
+        "post_processed": _value_or_none(lambda: post_processed(problem, best.x)),
+        "actuation_off": _value_or_none(lambda: unactuated(problem, best.x)),
+        "disconnected_particles": int(
+            (pieces(problem.scene, threshold.kept(problem, best.x)) > 0).sum()
+        ),
+        "post_processed_half_step": _number_or_none(audits[1].distance),
+        # Over the full block where it goes farther: as designed, or as in the row.
+        "gain": {
+            row.name: _number_or_none(
+                threshold.beyond_rounding(
+                    problem.scene, row.distance - np.fmax(row.reference, block)
+                )
+            )
+            for row in audits
+        },
+        "gain_kept": {row.name: _number_or_none(row.kept) for row in others},
+        "non_discreteness": best.non_discreteness,
+        "a": numbers(actuation.a),
+        "theta": numbers(actuation.theta),
+        "b": numbers(actuation.b),
+        "evaluations": len(result.history),
+        "failed_evaluations": result.failed_evaluations,
+        "halved_evaluations": result.halved_evaluations,
+        "seconds": result.history[-1].seconds,
+        "stop_reason": result.stop_reason,
+    }
+
+
+def _value_or_none(function: Callable[[], float]) -> float | None:
+    """A value for the summary, null in JSON if there is none."""
+    try:
+        return _number_or_none(function())
+    except SimulationError as error:
+        logger.warning("no value: %s", error)
+        return None
+
+
+def _number_or_none(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def _shown(value: Any) -> str:
+    if value is None:
+        return "-"
+    return digits(value) if isinstance(value, float) else str(value)
+
+
+def table(summary: Mapping[str, Any]) -> str:
+    """The summary as aligned text."""
+    flat: dict[str, Any] = {}
+    for name, value in summary.items():
+        if isinstance(value, Mapping):
+            flat.update({f"{name}, {key}": item for key, item in value.items()})
+        else:
+            flat[name] = value
+    width = max(len(name) for name in flat)
+    lines = []
+    for name, value in flat.items():
+        values = value if isinstance(value, list) else [value]
+        shown = ", ".join(_shown(v) for v in values)
+        lines.append(f"{name.replace('_', ' '):<{width}}  {shown}")
+    return "\n".join(lines)

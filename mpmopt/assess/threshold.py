@@ -1,0 +1,216 @@
+"""Bodies without grey: every particle is solid or absent. Post-processing and references."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import label
+
+from mpmopt.design.actuation import signal
+from mpmopt.design.objective import Objective
+from mpmopt.design.problem import Problem, Variables
+from mpmopt.design.step_control import LIMITS, check_indicators
+from mpmopt.errors import DesignError, SimulationError
+from mpmopt.scene import Scene
+from mpmopt.scene.particles import discretise
+from mpmopt.simulation.simulation import Simulation
+from mpmopt.validation import shown
+
+THRESHOLD = 0.3  # of gamma, as in the paper
+NO_GAIN = 1e-12  # over the grid's size: what two equal bodies may differ by
+# Beyond a stretch of 1 over the particles per cell some cell has none: a body may crack there. An
+# optimiser may pass through (`LIMITS`), but nothing that went so far counts. What a cut carries
+# depends on this ratio alone, so one particle per cell bears no stretch at all.
+SOLID_LIMITS = LIMITS._replace(courant=np.inf, velocity_increment=np.inf, jacobian=0.0, stretch=1.0)
+
+Baseline = Callable[[NDArray[np.float64]], NDArray[np.bool_]]
+
+
+def solid_body(
+    scene: Scene, keep: NDArray[np.bool_], variables: Variables
+) -> tuple[Simulation, Objective]:
+    """The body of which only some design particles are there, all of them solid.
+
+    Parameters
+    ----------
+    scene : Scene
+    keep : (D,) array of bool
+        Design particles that are there; the others are not simulated at all.
+    variables : Variables
+        Its a, theta and b are the actuation.
+
+    Raises
+    ------
+    DesignError
+        If `keep` has another size, or the actuation is not within [-1, 1].
+    """
+    for name in ("a", "theta", "b"):
+        value = getattr(variables, name)
+        if np.iscomplexobj(value) or not np.all(np.abs(value) <= 1.0):
+            raise DesignError(f"{name} = {value} must be real and within [-1, 1]")
+    particles = discretise(scene)
+    designed = int(particles.designed.sum())
+    if np.shape(keep) != (designed,):
+        raise DesignError(f"keep has shape {np.shape(keep)}, the design particles {(designed,)}")
+    there = np.ones(particles.designed.size, dtype=bool)
+    there[particles.designed] = keep
+    particles = particles.subset(there)
+    ones = np.ones(there.sum())
+    material = scene.material
+    simulation = Simulation(
+        scene,
+        particles,
+        density=material.density * ones,
+        lame_lambda=material.lame_lambda * ones,
+        lame_mu=material.lame_mu * ones,
+        signal=signal(scene, variables.a, variables.theta, variables.b),
+    )
+    return simulation, Objective.of(scene, particles)
+
+
+def distance(
+    scene: Scene,
+    keep: NDArray[np.bool_],
+    variables: Variables,
+    objective: Callable[[Simulation], Objective] | None = None,
+) -> float:
+    """Objective L of a `solid_body`.
+
+    Parameters
+    ----------
+    scene, keep, variables
+        As in `solid_body`.
+    objective : callable, optional
+        That of a problem (`Problem.objective`), if it is not the scene's.
+
+    Raises
+    ------
+    DesignError
+        As `solid_body`.
+    SimulationError
+        If the simulation fails, or goes beyond `SOLID_LIMITS`.
+    """
+    simulation, travel = solid_body(scene, keep, variables)
+    if objective is not None:
+        travel = objective(simulation)
+    end = simulation.watch(travel.instants)
+    check_indicators(end.indicators, simulation, SOLID_LIMITS)
+    return float(travel.value(end.states))
+
+
+def kept(problem: Problem, x: NDArray, threshold: float = THRESHOLD) -> NDArray[np.bool_]:
+    """Which design particles (D,) have gamma >= threshold: post-processing leaves them.
+
+    Raises
+    ------
+    DesignError
+        If x does not fit, or the threshold is not between 0 and 1.
+    """
+    is_number = isinstance(threshold, (int, float, np.integer, np.floating))
+    if not is_number or not 0.0 < threshold < 1.0:
+        said = f"{threshold:g}" if is_number else shown(threshold)
+        raise DesignError(f"threshold = {said} must be between 0 and 1")
+    return problem.gamma(x) >= threshold
+
+
+def post_processed(problem: Problem, x: NDArray, threshold: float = THRESHOLD) -> float:
+    """Objective L once particles with gamma >= threshold are solid and the others removed.
+
+    Raises
+    ------
+    DesignError
+        As `kept`.
+    SimulationError
+        As `distance`.
+    """
+    keep, variables = kept(problem, x, threshold), problem.split(x)
+    return distance(problem.scene, keep, variables, problem.objective)
+
+
+def share_kept(scene: Scene, kept: float, gain: float) -> float:
+    """Share of a gain that is kept; not a number if there was none beyond rounding."""
+    gain = beyond_rounding(scene, gain)
+    return kept / gain if gain > 0.0 else float("nan")
+
+
+def beyond_rounding(scene: Scene, gain: float) -> float:
+    """A gain, or zero if it is no more than rounding of positions."""
+    return 0.0 if abs(gain) <= NO_GAIN * max(scene.grid.size) else gain
+
+
+def unactuated(problem: Problem, x: NDArray) -> float:
+    """Objective L of the post-processed design when no actuator works: how far it merely falls."""
+    variables = problem.split(x)
+    still = variables._replace(a=0.0 * variables.a, b=0.0 * variables.b)
+    return distance(problem.scene, kept(problem, x), still, problem.objective)
+
+
+def pieces(scene: Scene, keep: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Number of the connected piece that each kept design particle belongs to.
+
+    Neighbours on the particles' lattice hold together; piece 0 holds to a solid region.
+
+    Parameters
+    ----------
+    scene : Scene
+    keep : (D,) array of bool
+        Design particles that are there.
+
+    Returns
+    -------
+    (D,) array of int
+        0: held; 1, 2, ...: pieces that hang on nothing; -1: not there.
+    """
+    particles = discretise(scene)
+    there = ~particles.designed
+    there[particles.designed] = keep
+    index = np.floor(particles.position * scene.particles_per_cell / scene.grid.dx).astype(int)
+    i, j = (index - index.min(axis=0)).T
+    lattice = np.zeros((i.max() + 1, j.max() + 1), dtype=bool)
+    lattice[i, j] = there
+    labels = label(lattice)[0][i, j]
+    held = np.isin(labels, labels[~particles.designed])
+    _, number = np.unique(np.where(held, 0, labels), return_inverse=True)  # solid regions are 0
+    return np.where(there, number, -1)[particles.designed]
+
+
+def solid_reference(positions: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """A drawing in which all design particles are there: the simplest reference design."""
+    return np.ones(len(positions), dtype=bool)
+
+
+def farthest(
+    scene: Scene,
+    drawing: Baseline,
+    *actuations: Variables,
+    objective: Callable[[Simulation], Objective] | None = None,
+) -> float:
+    """Objective L of a drawn design with the best of some actuations, of those that run.
+
+    Parameters
+    ----------
+    scene : Scene
+    drawing : callable
+        From the design particles' reference positions (D, 2) to which of them are there (D,).
+    actuations : Variables
+    objective : callable, optional
+        As in `distance`.
+
+    Raises
+    ------
+    SimulationError
+        If none runs.
+    """
+    particles = discretise(scene)
+    keep = drawing(particles.position[particles.designed])
+    values, failure = [], None
+    for actuation in actuations:
+        try:
+            values.append(distance(scene, keep, actuation, objective))
+        except SimulationError as error:
+            failure = error
+    if failure is not None and not values:
+        raise failure
+    return max(values)

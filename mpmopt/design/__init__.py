@@ -1,0 +1,1 @@
+"""From design variables to a distance and its gradient."""

@@ -1,0 +1,365 @@
+"""Scene and design to objective and gradient: all that an optimiser sees."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpmopt.design.actuation import signal, signal_adjoint
+from mpmopt.design.chain import DesignChain
+from mpmopt.design.objective import Objective
+from mpmopt.design.step_control import LIMITS, check_indicators, too_long, with_halvings
+from mpmopt.errors import DesignError
+from mpmopt.scene import Scene
+from mpmopt.scene.particles import discretise, nearest_designed
+from mpmopt.simulation.buffers import Memory
+from mpmopt.simulation.checkpoints import Checkpointing
+from mpmopt.simulation.indicators import Indicators
+from mpmopt.simulation.simulation import Precision, Simulation, check_precision
+from mpmopt.validation import count, instance, share
+
+PICTURE = (
+    ": its entries are values at problem.particles.position[problem.particles.designed], column by "
+    "column from below; look a picture up there (see Problem.join), do not ravel it"
+)
+
+
+class Variables(NamedTuple):
+    """Design variables by name, each within [-1, 1].
+
+    Attributes
+    ----------
+    phi : (D,) array
+        Of the design particles.
+    a, theta, b : (K,) arrays
+        Amplitude, phase and bias of the actuators.
+    """
+
+    phi: NDArray
+    a: NDArray
+    theta: NDArray
+    b: NDArray
+
+    @classmethod
+    def of(cls, x: NDArray, designed: int) -> Variables:
+        """The parts of a vector x whose first `designed` entries are phi."""
+        phi, rest = x[:designed], x[designed:]
+        return cls(phi, *rest.reshape(3, -1))
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """A design evaluated, and how.
+
+    Attributes
+    ----------
+    value : float or complex
+        Objective L.
+    gradient : (D + 3 K,) array
+        Empty if only the value was asked for.
+    indicators : Indicators
+        Of the run that counts.
+    time_step : float
+        Of that run.
+    halved : int
+        How often the step was halved to get there.
+    """
+
+    value: Any
+    gradient: NDArray[np.float64]
+    indicators: Indicators
+    time_step: float
+    halved: int = 0
+
+
+class Problem:
+    """How far a design travels in a scene, and which way to change it.
+
+    The vector x of an optimiser is phi, a, theta, b in this order, all within [-1, 1].
+
+    Parameters
+    ----------
+    scene : Scene
+    beta : float, optional
+        Sharpness of the projection.
+    checkpointing : Checkpointing, optional
+    void_cutoff : float, optional
+        Design particles whose gamma is below this are not simulated. Their void weighs nothing
+        then, cannot be flung about, and costs no time; they return when the filter brings them
+        back. The objective jumps where gamma crosses this; its gradient is that between jumps.
+    halvings : int, optional
+        How often an evaluation that fails or goes beyond a limit is made again with half the time
+        step; then it is a SimulationError.
+    limits : Indicators, optional
+        Beyond which an evaluation is not trusted; None: only what fails is rejected.
+    precision : {"double", "single"}, optional
+        Of the simulation (`Simulation`).
+
+    Attributes
+    ----------
+    particles : Particles
+    chain : DesignChain
+    size : int
+        Number of design variables, D + 3 K.
+
+    Raises
+    ------
+    DesignError
+        If the scene is none, or beta, `void_cutoff`, `halvings`, `limits` or `precision` makes
+        no sense.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        beta: float = 1.0,
+        checkpointing: Checkpointing | None = None,
+        void_cutoff: float = 0.0,
+        halvings: int = 2,
+        limits: Indicators | None = LIMITS,
+        precision: Precision = "double",
+    ) -> None:
+        instance("Problem", "scene", scene, Scene)
+        self.checkpointing = Checkpointing() if checkpointing is None else checkpointing
+        instance("Problem", "checkpointing", self.checkpointing, Checkpointing)
+        self.scene = scene
+        self.precision: Precision = check_precision(precision)
+        self._memories: list[Memory] = []
+        self.void_cutoff = share("Problem", "void_cutoff", void_cutoff, error=DesignError)
+        self.halvings = count("Problem", "halvings", halvings, 0, error=DesignError)
+        if limits is not None:
+            instance("Problem", "limits", limits, Indicators)
+        self.limits = limits
+        self.particles = discretise(scene)
+        self.chain = DesignChain(scene, self.particles, beta)
+        self._designed = int(self.particles.designed.sum())
+        self.size = self._designed + 3 * len(scene.actuators)
+
+    def join(self, phi: Any, a: Any, theta: Any, b: Any) -> NDArray[np.float64]:
+        """The vector x of named variables; single numbers stand for all entries.
+
+        The entries of phi belong to the design particles, column by column from below, whatever
+        their regions: to positions, not to the rows of a picture. So a picture is looked up there;
+        one that is raveled would be scrambled, and no size tells.
+
+        Raises
+        ------
+        DesignError
+            If a shape does not fit or an entry is no real number.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from mpmopt.design.problem import Problem
+        >>> from mpmopt.scene import Actuator, Design, Grid, Scene
+        >>> c = 1 / 16
+        >>> body = Design((4 * c, 4 * c), (8 * c, 6 * c)), Actuator((4 * c, 6 * c), (8 * c, 7 * c))
+        >>> problem = Problem(Scene(Grid((16, 16), c), 4e-3, 10, body))
+        >>> picture = np.array([[1.0, 1.0, 1.0, 1.0], [1.0, -1.0, -1.0, 1.0]])  # two legs
+        >>> right, up = problem.particles.position[problem.particles.designed].T
+        >>> row, column = ((6 * c - up) / c).astype(int), ((right - 4 * c) / c).astype(int)
+        >>> x = problem.join(picture[row, column], a=1.0, theta=-0.3, b=-0.5)
+        >>> print(x[:8])  # the first two columns of particles: the left leg
+        [1. 1. 1. 1. 1. 1. 1. 1.]
+        >>> print(x[8:12])  # the next one: the gap, and the row above it
+        [-1. -1.  1.  1.]
+        """
+        sizes = (self._designed,) + 3 * (len(self.scene.actuators),)
+        parts = []
+        for name, value, size in zip(Variables._fields, (phi, a, theta, b), sizes):
+            array = _real(name, value)
+            if array.size not in (1, size) or array.ndim > 1:
+                hint = PICTURE if name == "phi" else ""
+                raise DesignError(
+                    f"{name} has shape {array.shape}, must have {(size,)} or (){hint}"
+                )
+            parts.append(np.broadcast_to(array, size))
+        return np.concatenate(parts)
+
+    def split(self, x: NDArray) -> Variables:
+        """The named variables of a vector x.
+
+        Raises
+        ------
+        DesignError
+            If x has another size, or an entry is not finite or outside [-1, 1].
+        """
+        x = _array("x", x)
+        x = x.copy() if x.dtype == complex else _real("x", x)
+        if x.shape != (self.size,):
+            raise DesignError(
+                f"x has shape {x.shape}, this problem's variables {(self.size,)}; Problem.join "
+                "makes x of its parts"
+            )
+        outside = ~(np.abs(x.real) <= 1.0)
+        if outside.any():
+            raise DesignError(
+                f"{outside.sum()} of {x.size} design variables are not within [-1, 1], the first "
+                f"is x[{outside.argmax()}] = {x[outside.argmax()]}"
+            )
+        return Variables.of(x, self._designed)
+
+    def transfer(self, other: Problem, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The design x of another problem as one of this problem, whose grid is another.
+
+        Each design particle takes phi from the nearest one of the other problem's.
+        """
+        instance("Problem.transfer", "other", other, Problem)
+        parts = other.split(x)
+        phi = parts.phi[nearest_designed(self.particles, other.particles)]
+        return self.join(phi, parts.a, parts.theta, parts.b)
+
+    def gamma(self, x: NDArray) -> NDArray:
+        """Material density (D,) of the design particles."""
+        return self.chain.field(self.split(x).phi).gamma
+
+    def present(self, phi: NDArray) -> NDArray[np.bool_]:
+        """Which of all particles are simulated (N,)."""
+        present = np.ones(len(self.particles.position), dtype=bool)
+        present[self.particles.designed] = self.chain.field(phi).gamma.real >= self.void_cutoff
+        return present
+
+    def simulation(self, x: NDArray) -> Simulation:
+        """The simulation of a design."""
+        phi, a, theta, b = self.split(x)
+        present, field = self.present(phi), self.chain.field(phi)
+        return Simulation(
+            self.scene,
+            self.particles.subset(present),
+            field.density[present],
+            field.lame_lambda[present],
+            field.lame_mu[present],
+            signal(self.scene, a, theta, b),
+            precision=self.precision,
+        )
+
+    def objective(self, simulation: Simulation) -> Objective:
+        """How far the body of a simulation goes: of this problem's, or of a solid one of its scene.
+
+        What pictures, post-processing and audits measure too, should a subclass have another.
+        """
+        return Objective.of(simulation.scene, simulation.particles)
+
+    def at(self, time_step: float) -> Problem:
+        """The same problem in another time step.
+
+        Raises
+        ------
+        SceneError
+            If the scene cannot be simulated with it.
+        """
+        other = copy.copy(self)
+        other.scene = self.scene.vary(time_step=time_step)
+        return other
+
+    def value(self, x: NDArray) -> Any:
+        """Objective L of a design, larger is farther; complex if x is complex.
+
+        Raises
+        ------
+        DesignError
+            If x does not fit.
+        SimulationError
+            If the simulation fails, or comes too close to it, in all time steps that are tried.
+        """
+        return self._accepted(lambda problem: problem._value(x)).value
+
+    def value_and_gradient(self, x: NDArray) -> tuple[float, NDArray[np.float64]]:
+        """Objective L and its gradient (D + 3 K,), by the reverse loop.
+
+        Raises
+        ------
+        DesignError, SimulationError, StorageError
+            As `evaluate`.
+        """
+        evaluation = self.evaluate(x)
+        return evaluation.value, evaluation.gradient
+
+    def evaluate(self, x: NDArray) -> Evaluation:
+        """Objective and gradient, and the time step that they are of.
+
+        Raises
+        ------
+        DesignError, SimulationError
+            As `value`; a gradient that is not finite is a SimulationError too.
+        StorageError
+            If checkpoints cannot be stored or read back.
+        """
+        x = _real("x", x)
+        return self._accepted(lambda problem: problem._value_and_gradient(x))
+
+    def _accepted(self, evaluate: Callable[[Problem], Evaluation]) -> Evaluation:
+        evaluation, halved = with_halvings(self, evaluate, self.halvings)
+        return dataclasses.replace(evaluation, halved=halved)
+
+    def _value(self, x: NDArray) -> Evaluation:
+        simulation = self.simulation(x)
+        objective = self.objective(simulation)
+        end = simulation.watch(objective.instants)
+        self._check(end.indicators, simulation)
+        value = _finite(objective.value(end.states), simulation)
+        return Evaluation(value, np.empty(0), end.indicators, self.scene.time_step)
+
+    def _value_and_gradient(self, x: NDArray[np.float64]) -> Evaluation:
+        phi, a, theta, _ = self.split(x)
+        simulation = self.simulation(x)
+        try:
+            memory = self._memories.pop()
+        except IndexError:  # the first evaluation, or others are under way
+            memory = Memory()
+        try:
+            return self._differentiate(phi, a, theta, simulation, memory)
+        finally:
+            self._memories.append(memory)
+
+    def _differentiate(
+        self, phi: NDArray, a: NDArray, theta: NDArray, simulation: Simulation, memory: Memory
+    ) -> Evaluation:
+        with simulation.checkpoints(self.checkpointing) as checkpoints:
+            objective = self.objective(simulation)
+            forward = simulation.forward(checkpoints, memory, objective.instants)
+            self._check(forward.indicators, simulation)
+            value = float(_finite(objective.value(forward.states), simulation))
+            gradient = forward.reverse(objective.terminal_adjoints(forward.states))
+        bars = np.zeros((3, len(self.particles.position)))
+        bars[:, self.present(phi)] = gradient.density, gradient.lame_lambda, gradient.lame_mu
+        phi_bar = self.chain.field(phi).pullback(*bars)
+        parts = phi_bar, *signal_adjoint(self.scene, a, theta, gradient.signal)
+        whole = _finite(np.concatenate(parts), simulation)
+        return Evaluation(value, whole, forward.indicators, self.scene.time_step)
+
+    def _check(self, indicators: Indicators, simulation: Simulation) -> None:
+        if self.limits is not None:
+            check_indicators(indicators, simulation, self.limits)
+
+
+def _array(name: str, value: Any) -> NDArray:
+    if np.ma.is_masked(value):
+        raise DesignError(f"{name} has masked entries, which have no value; fill them")
+    try:
+        return np.asarray(value)
+    except (ValueError, OverflowError) as error:
+        raise DesignError(f"{name} is no array of numbers: {error}") from error
+
+
+def _real(name: str, value: Any) -> NDArray[np.float64]:
+    array = _array(name, value)
+    if not (np.issubdtype(array.dtype, np.floating) or np.issubdtype(array.dtype, np.integer)):
+        raise DesignError(f"{name} holds {array.dtype}, must hold real numbers")
+    with np.errstate(over="ignore"):  # wider numbers: infinite ones are refused
+        return array.astype(float)
+
+
+def _finite(values: Any, simulation: Simulation) -> Any:
+    if not np.all(np.isfinite(values)):
+        raise too_long(
+            simulation,
+            f"{np.sum(~np.isfinite(values))} of {np.size(values)} results are not finite",
+        )
+    return values

@@ -1,0 +1,89 @@
+"""When an evaluation is rejected and its time step halved, and when solid is torn."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING, TypeVar
+
+from mpmopt.errors import FractureError, SimulationError
+from mpmopt.simulation.indicators import Indicators
+from mpmopt.simulation.simulation import Simulation
+
+if TYPE_CHECKING:
+    from mpmopt.design.problem import Problem
+
+logger = logging.getLogger(__name__)
+
+Result = TypeVar("Result")
+
+# An evaluation that goes beyond these is not trusted (docs: theory, "Step control"); the stretch is
+# over the particles per cell and direction.
+LIMITS = Indicators(courant=1.0, velocity_increment=0.5, jacobian=0.01, stretch=1.5, energy=0.05)
+
+
+def with_halvings(
+    problem: Problem, evaluate: Callable[[Problem], Result], halvings: int
+) -> tuple[Result, int]:
+    """An evaluation of a problem, or of it in a step that is short enough, and how often halved.
+
+    Raises
+    ------
+    SimulationError
+        If the last attempt fails; a `FractureError` at once, as no step mends it.
+    """
+    halved = 0
+    while True:
+        try:
+            return evaluate(problem), halved
+        except FractureError:
+            raise
+        except SimulationError as error:
+            if halved == halvings:
+                raise
+            logger.info("time step %g is halved: %s", problem.scene.time_step, error)
+        halved += 1
+        problem = problem.at(problem.scene.time_step / 2.0)
+
+
+def check_indicators(indicators: Indicators, simulation: Simulation, limits: Indicators) -> None:
+    """A run that went beyond a limit is an error.
+
+    Parameters
+    ----------
+    indicators : Indicators
+    simulation : Simulation
+    limits : Indicators
+        As `LIMITS`.
+
+    Raises
+    ------
+    SimulationError
+        If the step is too long; a `FractureError` if solid is torn, which no step mends.
+    """
+    flattest = 1.0 / limits.jacobian if limits.jacobian > 0.0 else math.inf
+    for what, value, limit in (
+        ("the Courant number of a stretched particle", indicators.courant, limits.courant),
+        ("dt |C| of a particle", indicators.velocity_increment, limits.velocity_increment),
+        ("1 / J of a particle", 1.0 / indicators.jacobian, flattest),
+        ("energy that appears from nowhere", indicators.energy, limits.energy),
+    ):
+        if not value <= limit:
+            raise too_long(simulation, f"{what} reached {value:.3g}, the limit is {limit:.3g}")
+    per_cell = simulation.scene.particles_per_cell
+    limit = limits.stretch * per_cell
+    if not indicators.stretch <= limit:
+        raise FractureError(
+            f"solid is stretched {indicators.stretch:.3g} times, beyond {limit:.3g} it tears",
+            simulation.steps,
+            -1,
+            (math.nan, math.nan),
+            f"take more particles per cell (now {per_cell}), a stiffer body or weaker actuation",
+        )
+
+
+def too_long(simulation: Simulation, what: str) -> SimulationError:
+    """What the step is too long for, as an error about the whole body."""
+    hint = f"take a smaller time step (now {simulation.scene.time_step:g})"
+    return SimulationError(what, simulation.steps, -1, (math.nan, math.nan), hint)

@@ -1,0 +1,1 @@
+"""Files, locks, checksums, and what is said on the terminal."""

@@ -1,0 +1,88 @@
+"""How far a long command is: a bar on a terminal, lines elsewhere; both on standard error."""
+
+from __future__ import annotations
+
+import logging
+import sys
+import time
+import weakref
+from contextlib import ExitStack, redirect_stderr
+from typing import Any, TextIO
+
+from tqdm import tqdm
+from tqdm.contrib import DummyTqdmFile
+
+from mpmopt.io.console import say
+
+LINES = 10  # of a work whose size is known; of another, one in so many steps
+
+
+class Progress:
+    """A bar that shows steps of work; off a terminal, a line now and then.
+
+    While there is a bar, log lines and what else goes to standard error are written above it.
+
+    Parameters
+    ----------
+    unit : str
+        What is counted, in the plural.
+    total : int, optional
+        How many there will be.
+
+    Attributes
+    ----------
+    count : int
+        How many are done.
+    """
+
+    def __init__(self, unit: str, total: int | None = None) -> None:
+        self._unit, self._total, self.count = unit, total, 0
+        self._every = max(1, total // LINES) if total else LINES
+        self._began = time.monotonic()
+        self._stream = sys.stderr
+        shown = self._stream is not None and self._stream.isatty()
+        self._bar = tqdm(
+            total=total, unit=f" {unit}", disable=not shown, leave=False, file=self._stream
+        )
+        undo = ExitStack()
+        if shown:
+            _write_above(self._stream, undo)
+        undo.callback(self._bar.close)
+        self._end = weakref.finalize(self, undo.close)  # also after an error
+
+    def __enter__(self) -> Progress:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def step(self, text: str = "") -> None:
+        """One step more is done; `text` says what it gave."""
+        self._bar.n = self.count
+        self.count += 1
+        self._bar.set_postfix_str(text, refresh=False)
+        self._bar.update()
+        if self._bar.disable and self.count % self._every == 0:
+            of = f" of {self._total}" if self._total else ""
+            seconds = time.monotonic() - self._began
+            line = f"{self.count}{of} {self._unit}, {seconds:.0f} s"
+            say(f"{line}: {text}" if text else line)
+
+    def close(self) -> None:
+        """Remove the bar."""
+        self._end()
+
+    def print(self, line: str) -> None:
+        """Print a line of results on standard output, above the bar."""
+        with self._bar.external_write_mode(self._stream):
+            print(line, flush=True)
+
+
+def _write_above(terminal: TextIO, undo: ExitStack) -> None:
+    """Let whole lines on standard error, those of loggers too, stand above all bars."""
+    stream: Any = DummyTqdmFile(terminal)
+    for logger in (logging.getLogger(), logging.getLogger("mpmopt")):
+        for handler in logger.handlers:
+            if isinstance(handler, logging.StreamHandler) and handler.stream is terminal:
+                undo.callback(handler.setStream, handler.setStream(stream))
+    undo.enter_context(redirect_stderr(stream))

@@ -1,0 +1,66 @@
+"""How kernels are compiled, and when what the disk keeps of them is stale.
+
+Numba's disk cache does not see that a callee in another file changed. So the cache of every kernel
+is stamped with a digest of all kernels' sources: after any change all of them are compiled anew.
+"""
+
+import hashlib
+import logging
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from numba import njit
+
+
+def _can_cache() -> bool:
+    """Whether Numba finds a folder to keep compiled kernels in; without one it would raise."""
+    try:
+        njit(cache=True)(_can_cache)
+    except RuntimeError:
+        logging.getLogger(__name__).warning(
+            "no folder to keep compiled kernels in, each start compiles them anew; let the "
+            "environment variable NUMBA_CACHE_DIR name one"
+        )
+        return False
+    return True
+
+
+def _digest() -> str:
+    """Of all kernels' sources."""
+    digest = hashlib.sha256()
+    for path in sorted(Path(__file__).parent.glob("*.py")):
+        digest.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")
+    return digest.hexdigest()
+
+
+STAMP = _digest()
+
+# No "nnan" or "ninf": comparisons must see what is not a number.
+OPTIONS: dict[str, Any] = {
+    "cache": _can_cache(),
+    "nogil": True,
+    "error_model": "numpy",
+    "fastmath": {"contract", "reassoc", "nsz", "arcp"},
+}
+
+
+def loop_jit(function: Callable[..., Any]) -> Any:
+    """Compile a loop that Python calls."""
+    return _stamped(njit(**OPTIONS)(function))
+
+
+def jit(function: Callable[..., Any]) -> Any:
+    """Compile a kernel that becomes part of the loops that call it.
+
+    Which of several compiled copies a loop calls would otherwise depend on whether it came from the
+    disk cache, and with it the last bits.
+    """
+    return _stamped(njit(**OPTIONS, forceinline=True)(function))
+
+
+def _stamped(kernel: Any) -> Any:
+    file = getattr(getattr(kernel, "_cache", None), "_cache_file", None)
+    if file is not None:  # the compiler and its cache are on
+        file._source_stamp = STAMP
+    return kernel

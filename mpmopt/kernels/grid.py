@@ -1,0 +1,109 @@
+"""Momentum and mass of nodes to their velocity."""
+
+from mpmopt.kernels.compiler import jit
+from mpmopt.kernels.contact import wall, wall_adjoint
+from mpmopt.kernels.simd import add, fused, load, nothing, store
+
+
+@jit
+def mirror(records, window, world):
+    """Add to each node what the mirrored half puts there; this map is its own transpose.
+
+    Records of nodes are (q_x, q_y, m, 0). With R the reflection, a node and its image across the
+    plane become r + R r_image and R r + r_image.
+    """
+    if world.mirror_axis < 0:
+        return
+    i0, j0, ni, nj = window
+    normal = world.mirror_axis
+    first, count, stride = (i0, ni, nj) if normal == 0 else (j0, nj, 1)
+    across, step = (nj, 1) if normal == 0 else (ni, nj)
+    plane = world.mirror_node - first
+    for line in range(across):
+        for k in range(count - plane):
+            node = line * step + (plane + k) * stride
+            image = line * step + (plane - k) * stride
+            for lane in range(3):
+                sign = -1.0 if lane == normal else 1.0
+                folded = records[image, lane] + sign * records[node, lane]
+                records[image, lane] = folded
+                records[node, lane] = sign * folded
+
+
+@jit
+def add_blocks(parts, field, windows, window, a, nodes):
+    """Column a of the window: the sum of what the blocks put there, in their order."""
+    i0, j0, _, nj = window
+    for k in range(a * nj, (a + 1) * nj):
+        store(nodes, k, nothing(nodes))
+    for b in range(parts.shape[0]):
+        column = i0 + a - windows[b, 0]
+        if 0 <= column < windows[b, 2]:
+            source, target = column * windows[b, 3], a * nj + windows[b, 1] - j0
+            for k in range(windows[b, 3]):
+                add(nodes, target + k, load(parts[b, field], source + k))
+
+
+@jit
+def free_velocity(grid, node, per_m, world):
+    """Velocity of a node from momentum, 1 / mass and gravity, before the walls."""
+    return (
+        fused(grid[0, node, 0], per_m, world.dt * world.gravity_x),
+        fused(grid[0, node, 1], per_m, world.dt * world.gravity_y),
+    )
+
+
+@jit
+def grid_update(grid, window, world, velocity, a):
+    """Velocity of column a's nodes from momentum, gravity and walls; zero where no mass is."""
+    i0, j0, _, nj = window
+    for b in range(nj):
+        node = a * nj + b
+        m = grid[0, node, 2]
+        u = v = 0.0 * m
+        if m.real > world.mass_tolerance:
+            u, v = free_velocity(grid, node, 1.0 / m, world)
+            u, v = wall(i0 + a, j0 + b, u, v, world)
+        velocity[0, 2 * node], velocity[0, 2 * node + 1] = u, v
+        if world.keep > 0.0:
+            u = v = 0.0 * m
+            if m.real > world.mass_tolerance:
+                per_m = 1.0 / grid[1, node, 2]
+                u, v = grid[1, node, 0] * per_m, grid[1, node, 1] * per_m
+            velocity[1, 2 * node], velocity[1, 2 * node + 1] = u, v
+
+
+@jit
+def grid_update_adjoint(grid, window, world, velocity_bar, node_bar, a):
+    """From velocity_bar of column a's nodes to their momentum_bar and mass_bar."""
+    i0, j0, _, nj = window
+    for b in range(nj):
+        node = a * nj + b
+        m = grid[0, node, 2]
+        if m > world.mass_tolerance:
+            per_m = 1.0 / m
+            u, v = grid[0, node, 0] * per_m, grid[0, node, 1] * per_m
+            u_bar, v_bar = wall_adjoint(
+                i0 + a,
+                j0 + b,
+                *free_velocity(grid, node, per_m, world),
+                world,
+                velocity_bar[0, 2 * node],
+                velocity_bar[0, 2 * node + 1],
+            )
+            momentum_bar(node_bar[0], node, u, v, per_m, u_bar, v_bar)
+            if world.keep > 0.0:
+                per_m = 1.0 / grid[1, node, 2]
+                u, v = grid[1, node, 0] * per_m, grid[1, node, 1] * per_m
+                u_bar, v_bar = velocity_bar[1, 2 * node], velocity_bar[1, 2 * node + 1]
+                momentum_bar(node_bar[1], node, u, v, per_m, u_bar, v_bar)
+        else:
+            node_bar[:, node] = 0.0
+
+
+@jit
+def momentum_bar(node_bar, node, u, v, per_m, u_bar, v_bar):
+    """Adjoint of a velocity (u, v) = q / m, into a node's record."""
+    node_bar[node, 0] = u_bar * per_m
+    node_bar[node, 1] = v_bar * per_m
+    node_bar[node, 2] = -fused(v_bar, v, u_bar * u) * per_m

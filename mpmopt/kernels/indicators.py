@@ -1,0 +1,37 @@
+"""How close particles come to where a step is too long, or where solid tears."""
+
+import math
+
+from mpmopt.kernels.arrays import AFFINE, DEFORMATION, components
+from mpmopt.kernels.compiler import jit
+from mpmopt.kernels.deformation import stretches
+from mpmopt.kernels.material import wave_modulus
+
+
+@jit
+def indicators(state, body, world, solid, first, last):
+    """How close groups of particles come to where a step is too long, as in `Indicators`.
+
+    The largest (dt / dx) sqrt(M / rho) and dt |C|, the smallest J, and the largest stretch of
+    particles whose mu is at least `solid`; M is their `wave_modulus`. Extremes do not depend on the
+    order in which they are taken.
+    """
+    stiffest = fastest = longest = 0.0
+    smallest = math.inf
+    for g in range(first, last):
+        for k in range(4):
+            mass, volume = body.mass[g, k].real, body.volume[g, k].real
+            if mass > 0.0:  # else it only fills its group
+                mu, lam = body.lame_mu[g, k].real, body.lame_lambda[g, k].real
+                c00, c01, c10, c11 = components(state, g, AFFINE, k)
+                F = components(state, g, DEFORMATION, k)
+                trace, apart = stretches(F)
+                stiffness = wave_modulus(trace, apart, lam, mu)
+                if mu >= solid:
+                    longest = max(longest, 0.5 * (trace + math.sqrt(apart)))
+                stiffest = max(stiffest, stiffness * volume / mass)
+                fastest = max(fastest, c00 * c00 + c01 * c01 + c10 * c10 + c11 * c11)
+                smallest = min(smallest, F[0] * F[3] - F[1] * F[2])
+    courant = world.dt / world.dx * math.sqrt(stiffest)
+    velocity_increment = world.dt * math.sqrt(fastest)
+    return courant, velocity_increment, smallest, math.sqrt(longest)

@@ -1,0 +1,266 @@
+"""An optimisation as it stands: its evaluations, its best designs, and what it needs to go on."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpmopt.design.problem import Problem
+from mpmopt.errors import DesignError
+from mpmopt.optimisation.settings import Settings
+from mpmopt.scene import Scene
+from mpmopt.scene.particles import own
+from mpmopt.validation import digits
+
+
+@dataclass(frozen=True, kw_only=True)
+class Iteration:
+    """One evaluation, in numbers.
+
+    Attributes
+    ----------
+    start : int
+        Index of the start that it goes back to.
+    stage : int
+        Index of the stage.
+    beta, move_limit : float
+        In force during the evaluation.
+    time_step : float
+        That the values are of; of the last attempt if it failed.
+    objective : float
+        L, or not a number if the evaluation failed.
+    non_discreteness : float
+        Mean of 4 gamma (1 - gamma).
+    projected_gradient : float
+        Greatest change of L per unit of x that the bounds leave free.
+    step : float
+        Greatest change of a variable since the last evaluation, as a fraction of its range.
+    seconds : float
+        Since the optimisation began, without the time between a stop and going on.
+    post_processed : float
+        L without void, or not a number if the stage does not ask for it or it failed.
+    audited : float
+        L without void with half the step or cells half as wide, whichever is less; not a number if
+        the stage does not ask for it or the design could not be its best anyway, minus infinity if
+        it failed.
+    halved : int
+        How often the stage's time step was halved for this evaluation.
+    courant, velocity_increment, jacobian, stretch, energy : float
+        Its `indicators.Indicators`, or not a number if it failed.
+    failure : str
+        Why the evaluation failed, or empty.
+    """
+
+    start: int
+    stage: int
+    beta: float
+    time_step: float
+    move_limit: float
+    objective: float
+    non_discreteness: float
+    projected_gradient: float
+    step: float
+    seconds: float
+    post_processed: float = np.nan
+    audited: float = np.nan
+    halved: int = 0
+    courant: float = np.nan
+    velocity_increment: float = np.nan
+    jacobian: float = np.nan
+    stretch: float = np.nan
+    energy: float = np.nan
+    failure: str = ""
+
+    @property
+    def counted(self) -> float:
+        """L without void, the least that was found; minus infinity if there is none."""
+        least = float(np.fmin(self.post_processed, self.audited))
+        return -np.inf if np.isnan(least) else least
+
+    def numbers(self) -> dict[str, Any]:
+        """The fields above by name, without the design of a `Candidate`."""
+        return {item.name: getattr(self, item.name) for item in dataclasses.fields(Iteration)}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Candidate(Iteration):
+    """An evaluation with the design that was evaluated.
+
+    Attributes
+    ----------
+    x : (n,) array
+        Design variables.
+    gamma : (D,) array
+        Their material density.
+    """
+
+    x: NDArray[np.float64]
+    gamma: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        own(self, "x", "gamma")
+
+
+@dataclass
+class Leg:
+    """How far one start has come.
+
+    Attributes
+    ----------
+    start : int
+        Its index.
+    x : (n,) array
+        The design that its stage began with.
+    stage : int
+        The stage that it is in, or after the last.
+    reason : str
+        Why its last stage ended; empty before.
+    gave_up : bool
+    best : dict of int to Candidate
+        The best evaluation of each stage that had one.
+    """
+
+    start: int
+    x: NDArray[np.float64]
+    stage: int = 0
+    reason: str = ""
+    gave_up: bool = False
+    best: dict[int, Candidate] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class StageState:
+    """A stage just after an evaluation: all that its next step depends on.
+
+    Attributes
+    ----------
+    time_step : float
+    failures : int
+        Failed evaluations in a row.
+    values : (k,) array
+        Objectives of those that succeeded.
+    gradient : (n,) array
+        Of the last evaluation, empty if it failed.
+    farthest : Candidate or None
+        The one with the largest objective.
+    farthest_gradient : (n,) array
+        Its gradient, empty if there is none.
+    mma : mapping of str to array or number
+        `MovingAsymptotes.state` before the step.
+    """
+
+    time_step: float
+    failures: int
+    values: NDArray[np.float64]
+    gradient: NDArray[np.float64]
+    farthest: Candidate | None
+    farthest_gradient: NDArray[np.float64]
+    mma: Mapping[str, Any]
+
+    def __post_init__(self) -> None:
+        own(self, "values", "gradient", "farthest_gradient")
+
+
+@dataclass(repr=False)
+class Optimisation:
+    """An optimisation as it stands: what `optimise` hands to callbacks and returns.
+
+    Attributes
+    ----------
+    scene : Scene
+    settings : Settings
+    legs : list of Leg
+        One for each start.
+    leg : int
+        Index of the one that goes on.
+    history : list of Iteration
+        All evaluations.
+    first, last : Candidate or None
+        The first and the last evaluation.
+    stage_state : StageState or None
+        Of the stage that is under way, after its last evaluation.
+    stop_reason : str
+        A sentence; empty while it runs.
+    """
+
+    scene: Scene
+    settings: Settings
+    legs: list[Leg]
+    leg: int = 0
+    history: list[Iteration] = field(default_factory=list)
+    first: Candidate | None = None
+    last: Candidate | None = None
+    stage_state: StageState | None = None
+    stop_reason: str = ""
+
+    @property
+    def best(self) -> dict[int, Candidate]:
+        """The best evaluation of each stage that had one, of the start that goes on."""
+        return self.legs[self.leg].best
+
+    @property
+    def result(self) -> Candidate:
+        """The best evaluation on the last stage's grid.
+
+        That is the one that counts most (`Candidate.counted`), where stages ask for bodies without
+        void, and of audited stages where there are some; else the best of the last stage that had
+        one, whose projection is the sharpest.
+
+        Raises
+        ------
+        DesignError
+            If no evaluation succeeded.
+        """
+        if not self.best:
+            last = f"; the last: {self.history[-1].failure}" if self.history else ""
+            raise DesignError(f"there is no design: no evaluation succeeded yet{last}")
+        stages = self.settings.stages
+        grid = stages[max(self.best)].coarsening
+
+        def merit(item: Candidate) -> tuple[bool, float, int]:
+            audited = stages[item.stage].audited and np.isfinite(item.counted)
+            return bool(audited), item.counted, item.stage
+
+        on_grid = (item for stage, item in self.best.items() if stages[stage].coarsening == grid)
+        return max(on_grid, key=merit)
+
+    def problem(self) -> Problem:
+        """The problem that `result` solves, in the time step that it was evaluated with."""
+        best = self.result
+        return self.settings.stages[best.stage].problem(self.scene, best.time_step)
+
+    def __repr__(self) -> str:
+        found, stages = "no design yet", self.settings.stages
+        if self.best:
+            best = self.result
+            found = (
+                f"best L = {digits(best.objective)} at stage {best.stage + 1} of {len(stages)}, "
+                f"beta {best.beta:g}"
+            )
+        return (
+            f"Run of {len(self.history)} evaluations, {self.failed_evaluations} failed: {found}. "
+            f"{self.stop_reason or 'Not finished.'}"
+        )
+
+    def _repr_png_(self) -> bytes | None:
+        """A picture for notebooks, once there is a design."""
+        if not self.best:
+            return None
+        from mpmopt.view import draw, plot
+
+        return draw.png(plot.overview(self), dpi=80)
+
+    @property
+    def failed_evaluations(self) -> int:
+        """Number of evaluations that failed."""
+        return sum(bool(iteration.failure) for iteration in self.history)
+
+    @property
+    def halved_evaluations(self) -> int:
+        """Number of evaluations that were halved with a shorter time step."""
+        return sum(iteration.halved > 0 for iteration in self.history)

@@ -1,0 +1,446 @@
+"""From a grey block to a robot: stages of moving asymptotes, each sharper than the last."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpmopt.assess import refinement
+from mpmopt.assess.threshold import post_processed
+from mpmopt.design.chain import non_discreteness
+from mpmopt.design.problem import Problem
+from mpmopt.errors import DesignError, SceneError, SimulationError
+from mpmopt.optimisation.history import Candidate, Iteration, Leg, Optimisation, StageState
+from mpmopt.optimisation.mma import MovingAsymptotes
+from mpmopt.optimisation.settings import Settings
+from mpmopt.scene import Scene
+from mpmopt.simulation.checkpoints import Checkpointing
+from mpmopt.simulation.indicators import Indicators
+from mpmopt.validation import instance, shown
+
+logger = logging.getLogger(__name__)
+
+# Factors on the move limit after a step that went back, and after one that went on.
+SHORTEN, LENGTHEN = 0.6, 1.2
+# How often a stage of which no design runs halves its time step before the run gives up.
+HALVINGS = 3
+
+
+Callback = Callable[[Optimisation], None]
+HOW = "write Settings(stages), or call what makes them, such as continuation(time_step)"
+
+
+def optimise(
+    scene: Scene,
+    settings: Settings,
+    start: NDArray[np.float64] | Sequence[float] | Sequence[NDArray[np.float64]],
+    callbacks: Iterable[Callback] | Callback = (),
+    checkpointing: Checkpointing | None = None,
+) -> Optimisation:
+    """Maximise the distance travelled, stage by stage.
+
+    An evaluation that fails steps back to the stage's farthest design and halves the move limit,
+    which then recovers slowly. A stage of which no design ran yet takes the best of the one before,
+    and if that fails too, halves its time step.
+
+    Parameters
+    ----------
+    scene : Scene
+    settings : Settings
+    start : (n,) array, or several
+        First design, within [-1, 1], of the first stage's scene (`Problem.join` makes it). Of
+        several the best after `Settings.scouting` stages goes on.
+    callbacks : iterable of callable, or one
+        Called after each evaluation and once at the end.
+    checkpointing : Checkpointing, optional
+
+    Raises
+    ------
+    DesignError
+        If `start` does not fit the scene, there is nothing to design, or anything is of another
+        kind.
+    SceneError
+        If a stage cannot be simulated, nothing actuates the body, it is in several pieces, or has
+        one particle per cell; all is checked before the first evaluation.
+    StorageError
+        If checkpoints cannot be stored.
+    """
+    return go_on(begin(scene, settings, start), callbacks, checkpointing)
+
+
+def begin(
+    scene: Scene,
+    settings: Settings,
+    start: NDArray[np.float64] | Sequence[float] | Sequence[NDArray[np.float64]],
+) -> Optimisation:
+    """An optimisation before its first evaluation, for `go_on`; see `optimise`.
+
+    Raises
+    ------
+    DesignError, SceneError
+        As `optimise`.
+    """
+    instance("optimise", "scene", scene, Scene)
+    instance("optimise", "settings", settings, Settings, HOW)
+    several = isinstance(start, Iterable) and not isinstance(start, np.ndarray)
+    starts: list[Any] = list(start) if several else [start]
+    if starts and all(isinstance(value, (int, float, np.number)) for value in starts):
+        starts = [starts]
+    scenes = [stage.scene(scene) for stage in settings.stages]
+    first = Problem(scenes[0])
+    designs = [first.join(*first.split(x)) for x in starts]
+    if not designs or first.size == 0:
+        raise DesignError("there is nothing to design: give a Design or an Actuator, and a start")
+    if len(designs) > 1 and settings.scouting == 0:
+        raise DesignError(f"{len(designs)} starts need Settings.scouting >= 1, the stages of each")
+    return Optimisation(scene, settings, [Leg(k, x) for k, x in enumerate(designs)])
+
+
+def check_body_fits(scene: Scene) -> None:
+    """Refuse a body that no optimisation makes a robot of, though it can be simulated.
+
+    Raises
+    ------
+    SceneError
+        If nothing actuates it, any stretch tears it, or it is in several pieces.
+    """
+    if not any(np.any(actuator.stress) for actuator in scene.actuators):
+        raise SceneError(
+            "optimise: the body has no Actuator with a stress, so it does not go by itself; add one"
+        )
+    if scene.particles_per_cell == 1:
+        raise SceneError(
+            "optimise: particles_per_cell = 1 leaves a cell without a particle at any stretch, and "
+            "no body that may crack there counts; take 2 or more"
+        )
+    first, *apart = scene.body
+    held = [first]
+    for region in held:  # which grows
+        held += [other for other in apart if scene.gap(region, other) is None]
+        apart = [other for other in apart if other not in held]
+    if not apart:
+        return
+    gap, region, other = min(
+        ((scene.gap(a, b) or 0.0, a, b) for a in apart for b in held), key=lambda item: item[0]
+    )
+    how = f"is {gap:.4g} ({gap / scene.grid.dx:.4g} cells) from" if gap else "only touches"
+    raise SceneError(
+        f"optimise: the body is in pieces: {region} {how} {other}{'' if gap else ' at a corner'}; "
+        "let them share an edge, or put a Design or a Solid between them"
+    )
+
+
+def go_on(
+    run: Optimisation,
+    callbacks: Iterable[Callback] | Callback = (),
+    checkpointing: Checkpointing | None = None,
+) -> Optimisation:
+    """Go on with an optimisation from where it stands to its end; see `optimise`.
+
+    What a callback saw after an evaluation is all that this needs: from there it takes, bit for
+    bit, the way of an optimisation that was never stopped.
+
+    Raises
+    ------
+    SceneError, StorageError
+        As `optimise`.
+    DesignError
+        If its legs do not fit its settings, or a callback is none.
+    """
+    instance("go_on", "run", run, Optimisation)
+    several = isinstance(callbacks, Iterable) and not callable(callbacks)
+    all_callbacks: list[Any] = list(callbacks) if several else [callbacks]  # type: ignore[arg-type]
+    for callback in all_callbacks:
+        if isinstance(callback, type) or not callable(callback):
+            raise DesignError(
+                f"callback {shown(callback)} must be a function of the run, or an object that is "
+                "called like one, such as ProgressBar()"
+            )
+    stages = len(run.settings.stages)
+    for index, leg in enumerate(run.legs):
+        if leg.start != index or not 0 <= leg.stage <= stages:
+            raise DesignError(
+                f"leg {index} is of start {leg.start}, at stage {leg.stage} of {stages}: the run "
+                "was changed, take a copy of it"
+            )
+    if not run.history:
+        check_body_fits(run.scene)
+    climb = _Climb(run, tuple(all_callbacks), checkpointing)
+    if run.stop_reason:
+        return run
+    scouting = run.settings.scouting if len(run.legs) > 1 else 0
+    for leg in run.legs:
+        if leg.stage < scouting and not leg.gave_up:
+            run.leg = leg.start
+            climb.stages(leg, scouting)
+    run.leg = max(run.legs, key=lambda leg: _merit(run, leg)).start
+    leg = run.legs[run.leg]
+    climb.stages(leg, stages)
+    reached = leg.stage + leg.gave_up
+    run.stop_reason = f"Stage {reached} of {stages} was the last: {leg.reason}"
+    climb.report()
+    return run
+
+
+def _merit(run: Optimisation, leg: Leg) -> tuple[int, float]:
+    """What starts are compared by: the last stage that had a design, and its best."""
+    if not leg.best:
+        return -1, -np.inf
+    item = leg.best[max(leg.best)]
+    return item.stage, item.counted if run.settings.stages[item.stage].solid else item.objective
+
+
+class _Climb:
+    """An optimisation on its way through the stages."""
+
+    def __init__(
+        self,
+        run: Optimisation,
+        callbacks: tuple[Callback, ...],
+        checkpointing: Checkpointing | None,
+    ) -> None:
+        self.run, self.callbacks, self.checkpointing = run, callbacks, checkpointing
+        self.scenes = [stage.scene(run.scene) for stage in run.settings.stages]
+        self.began = time.monotonic() - (run.history[-1].seconds if run.history else 0.0)
+
+    def report(self) -> None:
+        for callback in self.callbacks:
+            callback(self.run)
+
+    def stages(self, leg: Leg, last: int) -> None:
+        """Climb from where a leg stands through the stages before `last`."""
+        stages = self.run.settings.stages
+        while leg.stage < last and not leg.gave_up:
+            stage = _StageRun(self, leg)
+            before = leg.stage - 1
+            begins = self.run.stage_state is None and before >= 0
+            if begins and stage.stage.coarsening != stages[before].coarsening:
+                leg.x = stage.problem.transfer(Problem(self.scenes[before]), leg.x)
+            leg.x, leg.reason, leg.gave_up = stage.climb()
+            self.run.stage_state = None
+            logger.info("start %d, stage %d: %s", leg.start, leg.stage, leg.reason)
+            leg.stage += not leg.gave_up
+
+
+def _order(item: Iteration) -> tuple[float, float, float]:
+    """What solid designs are compared by."""
+    return item.counted, float(np.nan_to_num(item.post_processed, nan=-np.inf)), item.objective
+
+
+class _StageRun:
+    """One stage on its way: from its first design, or from its state after an evaluation."""
+
+    def __init__(self, whole: _Climb, leg: Leg) -> None:
+        self.whole, self.run, self.leg = whole, whole.run, leg
+        settings = self.run.settings
+        self.stage = settings.stages[leg.stage]
+        # All lengths are taken in these, so that no unit decides anything.
+        self.width = max(self.run.scene.grid.size)
+        state = self.run.stage_state
+        self._pose(state.time_step if state else None)
+        self.mma = MovingAsymptotes(
+            -np.ones(self.problem.size),
+            np.ones(self.problem.size),
+            move_limit=self.stage.move_limit,
+            asymptote_initial=0.5 / (self.stage.beta + 1.0) if settings.sharpen_asymptotes else 0.5,
+        )
+        self.values: list[float] = []
+        self.failures = 0
+        self.farthest: Candidate | None = None
+        self.gradient = self.farthest_gradient = np.empty(0)
+        if state:
+            self.mma.restore(state.mma)
+            self.values, self.failures = state.values.tolist(), state.failures
+            self.gradient = state.gradient
+            self.farthest, self.farthest_gradient = state.farthest, state.farthest_gradient
+
+    def _pose(self, time_step: float | None) -> None:
+        self.problem = self.stage.problem(self.run.scene, time_step, self.whole.checkpointing)
+
+    def state(self) -> StageState:
+        """All that the next step depends on."""
+        return StageState(
+            time_step=self.problem.scene.time_step,
+            failures=self.failures,
+            values=np.array(self.values),
+            gradient=self.gradient,
+            farthest=self.farthest,
+            farthest_gradient=self.farthest_gradient,
+            mma=self.mma.state(),
+        )
+
+    def climb(self) -> tuple[NDArray[np.float64], str, bool]:
+        """Climb to where the stop rule ends the stage.
+
+        Returns the design that the next stage starts from, why it stopped, and whether to give up.
+        """
+        if self.run.stage_state is None:
+            self._evaluate(self.leg.x)
+        while True:
+            assert self.run.last is not None
+            x, reason = self.run.last.x, self._stop_reason()
+            if not reason:
+                self._evaluate(self._step(x))
+            elif self.failures:
+                return x, reason, True
+            elif self.farthest is not None and self.run.settings.best_first:
+                return self.farthest.x, reason, False
+            else:
+                return x, reason, False
+
+    def _step(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The design to evaluate after x."""
+        mma = self.mma
+        if self.failures and self.farthest is None:
+            spare = self._best_before()
+            if spare is not None and not np.array_equal(spare, x):
+                return spare
+            scene = self.problem.scene
+            logger.warning("no design of this stage ran yet: time step %g halved", scene.time_step)
+            self._pose(scene.time_step / 2.0)
+            return x
+        if self.failures and self.farthest is not None:
+            mma.reset()
+            mma.move_limit /= 2.0
+            return self._move(self.farthest.x, self.farthest.objective, self.farthest_gradient)
+        went_back = len(self.values) > 1 and self.values[-1] < self.values[-2]
+        factor = SHORTEN if went_back and self.run.settings.adapt_move_limit else LENGTHEN
+        mma.move_limit = min(self.stage.move_limit, factor * mma.move_limit)
+        return self._move(x, self.values[-1], self.gradient)
+
+    def _move(
+        self, x: NDArray[np.float64], value: float, gradient: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """The step of the moving asymptotes from x."""
+        return self.mma.step(x, -value / self.width, -gradient / self.width)
+
+    def _best_before(self) -> NDArray[np.float64] | None:
+        """The best design of the stage before, on this stage's grid."""
+        before = self.run.best.get(self.leg.stage - 1)
+        if before is None or before.x.size == self.problem.size:
+            return before.x if before else None
+        return self.problem.transfer(Problem(self.whole.scenes[before.stage]), before.x)
+
+    def _evaluate(self, x: NDArray[np.float64]) -> None:
+        """Value and gradient, recorded, even of a simulation that failed."""
+        run = self.run
+        value, failure = np.nan, ""
+        gradient: NDArray[np.float64] = np.full(x.size, np.nan)
+        problem, halved = self.problem, self.problem.halvings
+        indicators = Indicators(*5 * (np.nan,))
+        time_step = problem.scene.time_step / 2.0**halved
+        try:
+            evaluation = problem.evaluate(x)
+            value, gradient = evaluation.value, evaluation.gradient
+            halved, indicators = evaluation.halved, evaluation.indicators
+            time_step = evaluation.time_step
+        except SimulationError as error:
+            failure = str(error)
+            logger.warning("evaluation %d failed: %s", len(run.history), error)
+        solid = audited = np.nan
+        if self.stage.solid and not failure:
+            solid = self._without_void(post_processed, problem.at(time_step), x)
+            best = run.best.get(self.leg.stage)
+            hopeful = solid > (best.counted if best else -np.inf)
+            if self.stage.audited and hopeful:
+                audited = self._without_void(refinement.least, problem.at(time_step), x)
+                audited = -np.inf if np.isnan(audited) else audited
+        before = run.last.x if run.last else x
+        if before.size != x.size:  # another grid
+            before = x
+        free = np.where(gradient > 0.0, x < 1.0, x > -1.0)
+        gamma = self.problem.gamma(x)
+        candidate = Candidate(
+            start=self.leg.start,
+            stage=self.leg.stage,
+            beta=self.stage.beta,
+            time_step=time_step,
+            move_limit=self.mma.move_limit,
+            x=x,
+            gamma=gamma,
+            objective=value,
+            non_discreteness=non_discreteness(gamma),
+            projected_gradient=float(np.abs(gradient * free).max()),
+            step=float(np.abs(x - before).max() / 2.0),
+            seconds=time.monotonic() - self.whole.began,
+            post_processed=solid,
+            audited=audited,
+            halved=halved,
+            courant=indicators.courant,
+            velocity_increment=indicators.velocity_increment,
+            jacobian=indicators.jacobian,
+            stretch=indicators.stretch,
+            energy=indicators.energy,
+            failure=failure,
+        )
+        self._record(candidate, gradient)
+        self.whole.report()
+
+    def _record(self, candidate: Candidate, gradient: NDArray[np.float64]) -> None:
+        run = self.run
+        run.first = run.first or candidate
+        run.last = candidate
+        run.history.append(Iteration(**candidate.numbers()))
+        if candidate.failure:
+            self.failures += 1
+            self.gradient = np.empty(0)
+        else:
+            self.failures = 0
+            self.values.append(candidate.objective)
+            self.gradient = gradient
+            if self.farthest is None or candidate.objective > self.farthest.objective:
+                self.farthest, self.farthest_gradient = candidate, gradient
+            if self._is_best(candidate):
+                run.best[candidate.stage] = candidate
+        run.stage_state = self.state()
+
+    def _is_best(self, item: Candidate) -> bool:
+        """Whether it is better than the best of its stage so far."""
+        best = self.run.best.get(item.stage)
+        if best is None:
+            return True
+        if not self.stage.solid:
+            return item.objective > best.objective
+        if self.stage.audited and np.isnan(item.audited):
+            return False
+        return _order(item) > _order(best)
+
+    def _without_void(
+        self,
+        distance: Callable[[Problem, NDArray[np.float64]], float],
+        problem: Problem,
+        x: NDArray[np.float64],
+    ) -> float:
+        try:
+            return distance(problem, x)
+        except (SceneError, SimulationError) as error:
+            logger.warning("the design fails without void: %s", error)
+            return np.nan
+
+    def _stop_reason(self) -> str:
+        """Why the stage ends after its last evaluation, or nothing."""
+        settings = self.run.settings
+        if self.failures:
+            none_ran = self.farthest is None
+            if self.failures >= settings.most_failures or (none_ran and self.failures > HALVINGS):
+                return f"it gave up after {self.failures} failed evaluations in a row."
+            return ""
+        values, count, window = self.values, len(self.values), settings.window
+        if count >= max(settings.least, window + 1):
+            change = abs(np.mean(values[-window:]) - np.mean(values[-window - 1 : -1]))
+            limit = settings.tolerance * self.width
+            if change <= limit:
+                last = self.run.history[-1]
+                return (
+                    f"the mean objective over {window} iterations changed by {change:.1e} <= "
+                    f"{limit:.1e} after {count} of them (last step {last.step:.1e} of the range, "
+                    f"projected gradient {last.projected_gradient:.1e})."
+                )
+        if count >= (self.stage.most_iterations or settings.most_iterations):
+            return f"it reached its limit of {count} iterations."
+        return ""

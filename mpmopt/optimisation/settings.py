@@ -1,0 +1,208 @@
+"""How to optimise: stages of a continuation, and what ends them."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from mpmopt.design.problem import Problem
+from mpmopt.design.step_control import LIMITS
+from mpmopt.errors import DesignError
+from mpmopt.scene import Scene
+from mpmopt.simulation.checkpoints import Checkpointing
+from mpmopt.validation import count, flag, number, share, shown
+
+# Successful evaluations of a stage before the stop rule may end it.
+LEAST = 20
+
+
+@dataclass(frozen=True)
+class Stage:
+    """What one stage of the continuation holds fixed.
+
+    Attributes
+    ----------
+    beta : float
+        Sharpness of the projection.
+    void_density, void_stiffness : float
+        Share of mass and stiffness that void keeps.
+    time_step : float
+    solid : bool
+        Whether the best design is the one that goes farthest once its void is removed
+        (`threshold.post_processed`), which costs a forward run more, instead of as it is. The climb
+        itself goes on from the one that goes farthest as it is.
+    audited : bool
+        Whether such a design counts with the least of this and of the same with half the step and
+        with cells half as wide (`refinement.least`), so that the best is one that keeps its gain.
+        This costs four gradients more for each design that goes farther than the best so far.
+    coarsening : int
+        How many of the scene's cells go into the width of this stage's: early stages need no more.
+    move_limit : float
+        Greatest step of a variable, as a fraction of its range.
+    void_cutoff : float
+        Design particles whose gamma is below this are not simulated (`Problem`).
+    most_iterations : int, optional
+        Successful evaluations of this stage, instead of `Settings.most_iterations`.
+    halvings : int
+        How often an evaluation is made again with half the time step (`Problem`).
+    limited : bool
+        Whether an evaluation that goes beyond `step_control.LIMITS` is rejected too, or only one
+        that fails.
+
+    Raises
+    ------
+    DesignError
+        If a number makes no sense.
+    """
+
+    beta: float
+    void_density: float
+    void_stiffness: float
+    time_step: float
+    solid: bool = False
+    audited: bool = False
+    coarsening: int = 1
+    move_limit: float = 0.05
+    void_cutoff: float = 0.0
+    most_iterations: int | None = None
+    halvings: int = 2
+    limited: bool = True
+
+    def __post_init__(self) -> None:
+        for name in ("beta", "void_density", "void_stiffness", "time_step", "move_limit"):
+            value = number("Stage", name, getattr(self, name), above=0.0, error=DesignError)
+            object.__setattr__(self, name, value)
+        for name in ("void_density", "void_stiffness", "move_limit"):
+            if getattr(self, name) > 1.0:
+                raise DesignError(f"Stage: {name} = {getattr(self, name)} must be at most 1")
+        void_cutoff = share("Stage", "void_cutoff", self.void_cutoff, error=DesignError)
+        object.__setattr__(self, "void_cutoff", void_cutoff)
+        for name in ("solid", "audited", "limited"):
+            value = flag("Stage", name, getattr(self, name), error=DesignError)
+            object.__setattr__(self, name, value)
+        if self.audited and not self.solid:
+            raise DesignError("Stage: audited = True needs solid = True")
+        if self.most_iterations is not None:
+            most = count("Stage", "most_iterations", self.most_iterations, 1, error=DesignError)
+            object.__setattr__(self, "most_iterations", most)
+        coarsening = count("Stage", "coarsening", self.coarsening, 1, error=DesignError)
+        object.__setattr__(self, "coarsening", coarsening)
+        halvings = count("Stage", "halvings", self.halvings, 0, error=DesignError)
+        object.__setattr__(self, "halvings", halvings)
+
+    def scene(self, scene: Scene) -> Scene:
+        """The scene as this stage simulates it."""
+        return scene.vary(
+            time_step=self.time_step,
+            void_density=self.void_density,
+            void_stiffness=self.void_stiffness,
+            coarsening=self.coarsening,
+        )
+
+    def problem(
+        self,
+        scene: Scene,
+        time_step: float | None = None,
+        checkpointing: Checkpointing | None = None,
+    ) -> Problem:
+        """The problem that this stage solves, in another time step if it ended with one."""
+        stage = self if time_step is None else dataclasses.replace(self, time_step=time_step)
+        return Problem(
+            stage.scene(scene),
+            self.beta,
+            checkpointing,
+            self.void_cutoff,
+            self.halvings,
+            LIMITS if self.limited else None,
+        )
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How to optimise.
+
+    Attributes
+    ----------
+    stages : tuple of Stage
+        Or a single one.
+    adapt_move_limit : bool
+        Shorten the move limit after a step that went back, and lengthen it, up to the stage's,
+        after one that went on.
+    sharpen_asymptotes : bool
+        Initial asymptotes at 0.5 / (beta + 1) of the range instead of 0.5.
+    best_first : bool
+        Start each stage from the design of the one before that went farthest, instead of its last.
+    window : int
+        Iterations in the moving average of the stop rule.
+    tolerance : float
+        A stage ends when the moving average changes by no more than this share of the grid's
+        longer side.
+    least_iterations : int, optional
+        Successful evaluations of a stage before the stop rule may end it; default: 20, or
+        `most_iterations` if that is less.
+    most_iterations : int
+        Successful evaluations of a stage.
+    most_failures : int
+        Failed evaluations in a row after which the optimisation gives up.
+    scouting : int
+        Of several starts, each goes through so many of the first stages; then the best goes on.
+
+    Raises
+    ------
+    DesignError
+        If there is no stage or a number makes no sense.
+    """
+
+    stages: tuple[Stage, ...]
+    adapt_move_limit: bool = True
+    sharpen_asymptotes: bool = True
+    best_first: bool = True
+    window: int = 10
+    tolerance: float = 2e-4
+    least_iterations: int | None = None
+    most_iterations: int = 200
+    most_failures: int = 8
+    scouting: int = 0
+
+    def __post_init__(self) -> None:
+        given: Any = self.stages
+        stages = tuple(given) if isinstance(given, Iterable) else (given,)
+        if not stages or not all(isinstance(stage, Stage) for stage in stages):
+            raise DesignError(f"Settings: stages = {shown(given)} must be Stages, at least one")
+        object.__setattr__(self, "stages", stages)
+        for name in ("adapt_move_limit", "sharpen_asymptotes", "best_first"):
+            value = flag("Settings", name, getattr(self, name), error=DesignError)
+            object.__setattr__(self, name, value)
+        for name in ("window", "least_iterations", "most_iterations", "most_failures"):
+            given = getattr(self, name)
+            if name != "least_iterations" or given is not None:
+                given = count("Settings", name, given, 1, error=DesignError)
+                object.__setattr__(self, name, given)
+        scouting = count("Settings", "scouting", self.scouting, 0, error=DesignError)
+        object.__setattr__(self, "scouting", scouting)
+        if scouting > len(self.stages):
+            raise DesignError(
+                f"Settings: scouting = {scouting} is above the number of stages {len(self.stages)}"
+            )
+        tolerance = number("Settings", "tolerance", self.tolerance, error=DesignError)
+        object.__setattr__(self, "tolerance", tolerance)
+        if self.least > self.most_iterations:
+            raise DesignError(
+                f"Settings: least_iterations = {self.least_iterations} is above "
+                f"most_iterations = {self.most_iterations}"
+            )
+        if self.tolerance < 0.0:
+            raise DesignError(f"Settings: tolerance = {self.tolerance} must not be negative")
+
+    @property
+    def least(self) -> int:
+        """`least_iterations`, or what it is by default."""
+        default = min(LEAST, self.most_iterations)
+        return default if self.least_iterations is None else self.least_iterations
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Settings:
+        """The settings of which `dataclasses.asdict` makes these values."""
+        return cls(**{**values, "stages": tuple(Stage(**stage) for stage in values["stages"])})

@@ -1,0 +1,285 @@
+"""The one file that a run leaves: scene, settings, versions, history and designs, in HDF5.
+
+Layout (version 4)::
+
+    attributes       format, version, leg (the start that goes on), stop_reason; as JSON:
+                     scene, settings, versions, summary
+    history/NAME     one entry per evaluation: objective, beta, non_discreteness, step, ...
+    best/            the best of all, with gamma, phi, a, theta, b; attribute stage
+    legs/L/          start L: the design x that its stage began with; attributes stage, reason, ...
+    legs/L/stages/K/ its best design of stage K: x, gamma; attributes of its evaluation
+    first/, last/    the first and the last evaluation, in the same way
+    stage/           a stage that is under way: what its next step depends on
+    drawing/C        which particles of a drawn design are there, with C cells of the scene in one
+
+The file is sealed with a digest of all its bytes (`checksums`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import platform
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+import mpmopt
+from mpmopt.design.problem import Variables
+from mpmopt.errors import RunFileError, StorageError
+from mpmopt.io.checksums import LARGEST, SEAL, file_in_memory, refusing, sealed, unsealed
+from mpmopt.io.files import replace_file
+from mpmopt.optimisation.history import Candidate, Iteration, Leg, Optimisation, StageState
+from mpmopt.optimisation.settings import Settings
+from mpmopt.scene import Scene
+from mpmopt.validation import instance, place
+
+FORMAT, VERSION = "mpmopt run", 4
+WHOLE = tuple(f.name for f in dataclasses.fields(Iteration) if f.type == "int")
+COLUMNS = tuple(f.name for f in dataclasses.fields(Iteration) if f.type in ("int", "float"))
+
+
+@dataclass(frozen=True)
+class RunFile:
+    """What a run file holds.
+
+    Attributes
+    ----------
+    run : Optimisation
+        As it stood: `loop.go_on` goes on with it.
+    versions : dict of str to str
+        Of this package and of those it computes with.
+    summary : dict
+        That of `summary.summarise`; empty if there is none yet.
+    drawing : dict of int to (D,) array of bool
+        Which design particles a design drawn by hand has, for each coarsening of the stages; empty
+        if there is none.
+    """
+
+    run: Optimisation
+    versions: dict[str, str]
+    summary: dict[str, Any] = field(default_factory=dict)
+    drawing: dict[int, NDArray[np.bool_]] = field(default_factory=dict, repr=False)
+
+
+def write(
+    path: str | os.PathLike[str],
+    run: Optimisation,
+    summary: Mapping[str, Any] | None = None,
+    drawing: Mapping[int, NDArray[np.bool_]] | None = None,
+) -> None:
+    """Write a run as it stands; an older file of that name is replaced only by a complete one.
+
+    Parameters
+    ----------
+    path : str or path
+    run : Optimisation
+    summary : mapping, optional
+        Of a finished run.
+    drawing : mapping of int to (D,) array of bool, optional
+        As in `RunFile`.
+
+    Raises
+    ------
+    StorageError
+        If the file cannot be written, or nothing would read it back; an older one is still whole.
+    """
+    path = place("runfile.write", "path", path)
+    instance("runfile.write", "run", run, Optimisation)
+    with file_in_memory() as file:
+        _fill(file, run)
+        file.attrs["summary"] = json.dumps(dict(summary or {}))
+        for coarsening, there in (drawing or {}).items():
+            file.create_dataset(f"drawing/{coarsening}", data=there, dtype="?")
+        file.flush()
+        image = file.id.get_file_image()
+    if len(image) + SEAL > LARGEST:
+        raise StorageError(
+            f"{path} would have {len(image):.3g} bytes, more than {LARGEST:.0e}, which nothing "
+            "reads back; take fewer stages or starts, or fewer particles"
+        )
+    replace_file(path, sealed(image))
+
+
+def _fill(file: h5py.File, run: Optimisation) -> None:
+    file.attrs["format"], file.attrs["version"] = FORMAT, VERSION
+    file.attrs["scene"] = run.scene.to_json()
+    file.attrs["settings"] = json.dumps(dataclasses.asdict(run.settings))
+    file.attrs["versions"] = json.dumps(versions())
+    file.attrs["stop_reason"] = run.stop_reason
+    file.attrs["leg"] = run.leg
+    for name in COLUMNS:
+        column = np.array([getattr(item, name) for item in run.history], dtype=float)
+        file.create_dataset(f"history/{name}", data=column, dtype="f8")
+    file.create_dataset(
+        "history/failure", data=[i.failure for i in run.history], dtype=h5py.string_dtype()
+    )
+    for number, leg in enumerate(run.legs):
+        group = file.create_group(f"legs/{number}")
+        group.create_dataset("x", data=leg.x, dtype="f8")
+        for name in ("start", "stage", "reason", "gave_up"):
+            group.attrs[name] = getattr(leg, name)
+        for stage, item in leg.best.items():
+            _write_candidate(group, f"stages/{stage}", item)
+    for name in ("first", "last"):
+        _write_candidate(file, name, getattr(run, name))
+    if run.stage_state is not None:
+        _write_stage(file.create_group("stage"), run.stage_state)
+    if run.best:
+        x, gamma = run.result.x, run.result.gamma
+        group = file.create_group("best")
+        group.attrs["stage"] = run.result.stage
+        for name, value in {"gamma": gamma, **Variables.of(x, gamma.size)._asdict()}.items():
+            group.create_dataset(name, data=value, dtype="f8")
+
+
+def _write_candidate(parent: h5py.Group, name: str, item: Candidate | None) -> None:
+    if item is None:
+        return
+    group = parent.create_group(name)
+    group.create_dataset("x", data=item.x, dtype="f8")
+    group.create_dataset("gamma", data=item.gamma, dtype="f8")
+    for key, value in item.numbers().items():
+        group.attrs[key] = value
+
+
+def _write_stage(group: h5py.Group, state: StageState) -> None:
+    group.attrs["time_step"], group.attrs["failures"] = state.time_step, state.failures
+    for name in ("values", "gradient", "farthest_gradient"):
+        group.create_dataset(name, data=getattr(state, name), dtype="f8")
+    _write_candidate(group, "farthest", state.farthest)
+    for name, value in state.mma.items():
+        group.create_dataset(f"mma/{name}", data=value, dtype="f8")
+
+
+def versions() -> dict[str, str]:
+    """Of this package and of those it computes with."""
+    import numba
+    import scipy
+
+    return {
+        "mpmopt": mpmopt.__version__,
+        "python": platform.python_version(),
+        "numba": numba.__version__,
+        "numpy": np.__version__,
+        "scipy": scipy.__version__,
+        "h5py": h5py.__version__,
+    }
+
+
+def read_run(path: str | os.PathLike[str]) -> RunFile:
+    """Read a run file.
+
+    Raises
+    ------
+    RunFileError
+        If it does not exist, is no run file, is damaged or of another version.
+    """
+    path = place("runfile.read", "path", path)
+    with refusing(path, "run file", RunFileError):
+        if not path.is_file():
+            what = "is no file" if path.exists() else "is not there"
+            raise RunFileError(f"{path} {what}; give the path of a run.h5")
+        with unsealed(path, "run file") as file:
+            return _read(file, path)
+
+
+def _read(file: h5py.File, path: Path) -> RunFile:
+    if file.attrs.get("format") != FORMAT:
+        raise RunFileError(f"{path} is HDF5 but no run file of mpmopt")
+    if file.attrs["version"] != VERSION:
+        raise RunFileError(
+            f"{path} is a run file of version {file.attrs['version']}, this mpmopt reads version "
+            f"{VERSION}; its versions: {file.attrs.get('versions')}"
+        )
+    settings = Settings.from_dict(json.loads(file.attrs["settings"]))
+    stages = len(settings.stages)
+    legs = [_read_leg(file[f"legs/{number}"], stages) for number in range(len(file["legs"]))]
+    run = Optimisation(
+        scene=Scene.from_json(file.attrs["scene"]),
+        settings=settings,
+        legs=legs,
+        leg=int(file.attrs["leg"]),
+        history=_read_history(file["history"]),
+        first=_read_candidate(file, "first"),
+        last=_read_candidate(file, "last"),
+        stage_state=_read_stage(file["stage"]) if "stage" in file else None,
+        stop_reason=str(file.attrs["stop_reason"]),
+    )
+    if not 0 <= run.leg < len(legs):
+        raise ValueError(f"leg {run.leg} of {len(legs)}")
+    return RunFile(
+        run,
+        versions=json.loads(file.attrs["versions"]),
+        summary=dict(json.loads(file.attrs["summary"])),
+        drawing={int(name): item[:] for name, item in file.get("drawing", {}).items()},
+    )
+
+
+def _read_history(group: h5py.Group) -> list[Iteration]:
+    columns: dict[str, Any] = {name: _numbers(group, name).tolist() for name in COLUMNS}
+    columns["failure"] = group["failure"].asstr()[:].tolist()
+    for name in WHOLE:
+        columns[name] = [int(value) for value in columns[name]]
+    if len({len(column) for column in columns.values()}) != 1:
+        raise ValueError("the history's columns have different lengths")
+    return [Iteration(**dict(zip(columns, row))) for row in zip(*columns.values())]
+
+
+def _read_leg(group: h5py.Group, stages: int) -> Leg:
+    best = {}
+    for name in sorted(group.get("stages", ()), key=int):
+        item = _read_candidate(group["stages"], name)
+        if item is None or item.stage != int(name) or not 0 <= item.stage < stages:
+            raise ValueError(f"a design of stage {name} of {stages}")
+        best[item.stage] = item
+    attributes = group.attrs
+    return Leg(
+        start=int(attributes["start"]),
+        x=_numbers(group, "x"),
+        stage=int(attributes["stage"]),
+        reason=str(attributes["reason"]),
+        gave_up=bool(attributes["gave_up"]),
+        best=best,
+    )
+
+
+def _read_candidate(parent: h5py.Group, name: str) -> Candidate | None:
+    if name not in parent:
+        return None
+    group = parent[name]
+    numbers: dict[str, Any] = {key: float(group.attrs[key]) for key in COLUMNS}
+    numbers.update({key: int(group.attrs[key]) for key in WHOLE})
+    failure = str(group.attrs["failure"])
+    return Candidate(
+        **numbers, failure=failure, x=_numbers(group, "x"), gamma=_numbers(group, "gamma")
+    )
+
+
+def _read_stage(group: h5py.Group) -> StageState:
+    state = StageState(
+        time_step=float(group.attrs["time_step"]),
+        failures=int(group.attrs["failures"]),
+        values=_numbers(group, "values"),
+        gradient=_numbers(group, "gradient"),
+        farthest=_read_candidate(group, "farthest"),
+        farthest_gradient=_numbers(group, "farthest_gradient"),
+        mma={name: item[()] for name, item in group["mma"].items()},
+    )
+    farthest = 0 if state.farthest is None else state.farthest.x.size
+    if state.farthest_gradient.size != farthest or (state.gradient.size and not state.values.size):
+        raise ValueError("a stage whose values, gradients and designs do not fit together")
+    return state
+
+
+def _numbers(group: h5py.Group, name: str) -> NDArray[np.float64]:
+    dataset = group[name]
+    if not isinstance(dataset, h5py.Dataset) or dataset.dtype != np.float64 or dataset.ndim != 1:
+        raise ValueError(f"{group.name}/{name} is no column of 64-bit numbers")
+    return np.asarray(dataset[:], dtype=float)

@@ -1,0 +1,27 @@
+"""What is simulated: grid, time, material, body and walls."""
+
+from mpmopt.scene.parts import (
+    Actuator,
+    Design,
+    Grid,
+    Material,
+    Mirror,
+    Region,
+    Solid,
+    Vector,
+    Wall,
+)
+from mpmopt.scene.scene import Scene
+
+__all__ = [
+    "Actuator",
+    "Design",
+    "Grid",
+    "Material",
+    "Mirror",
+    "Region",
+    "Scene",
+    "Solid",
+    "Vector",
+    "Wall",
+]

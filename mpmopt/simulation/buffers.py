@@ -1,0 +1,177 @@
+"""Working memory of a run: the steps of a segment, and what one run leaves to the next."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from mpmopt import kernels
+from mpmopt.errors import SimulationError, StorageError
+from mpmopt.scene.checks import MOST_NUMBERS
+from mpmopt.simulation.checkpoints import Checkpoints
+from mpmopt.simulation.threads import in_parallel
+
+if TYPE_CHECKING:
+    from mpmopt.simulation.simulation import Simulation
+
+
+class Memory:
+    """Working memory that one run leaves to the next.
+
+    Memory that is new to a process costs more time than what a run writes into it.
+    """
+
+    def __init__(self) -> None:
+        self._buffers: dict[str, NDArray[np.uint8]] = {}
+        self.runs = 0  # that it was given to
+
+    def take(self, name: str, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray:
+        """An array with any content, in the place of the last one of that name."""
+        size = math.prod(shape) * np.dtype(dtype).itemsize
+        if name not in self._buffers or self._buffers[name].size < size:
+            self._buffers.pop(name, None)
+            try:
+                self._buffers[name] = np.empty(size, np.uint8)
+            except MemoryError as error:
+                raise StorageError(
+                    f"no memory for {size} bytes of {name}: {error}; store fewer states "
+                    "(Checkpointing.memory, .every), or simulate fewer particles"
+                ) from error
+        return self._buffers[name][:size].view(dtype).reshape(shape)
+
+
+class Segment:
+    """What `kernels.advance` leaves of the steps of a segment, and scratch arrays."""
+
+    def __init__(self, simulation: Simulation, length: int, memory: Memory) -> None:
+        self.simulation, self.memory = simulation, memory
+        memory.runs += 1
+        self.run = memory.runs
+        groups, dtype = simulation.body.mass.shape[0], simulation.initial.dtype
+        states = (length + 1, kernels.STATE_SIZE * groups, 4)
+        self.states = memory.take("states", states, dtype)
+        self.blocks = len(simulation.body.first) - 1
+        self.windows = np.zeros((length, self.blocks + 1, 4), np.int64)
+        self.logs = memory.take("logs", (length, groups, 4), dtype)
+        self.grids = np.empty((length, simulation.fields, 0, kernels.NODE_SIZE), dtype)
+        self.recomputed: set[int] = set()  # segments whose windows outgrew their room in the store
+        kept = length * simulation.fields * simulation.room[0] * kernels.NODE_SIZE
+        self.most = max(MOST_NUMBERS, 4 * kept)
+        self.reserve(*simulation.room, 0)
+
+    def reserve(self, nodes: int, part: int, step: int) -> None:
+        """`resize`, unless that would take far more memory than the run began with."""
+        length, fields, _, _ = self.grids.shape
+        kept = length * fields * nodes * kernels.NODE_SIZE
+        shared = max(self.blocks, 2 * 9) * fields * part * kernels.NODE_SIZE
+        for numbers, most in ((kept, self.most), (shared, MOST_NUMBERS)):
+            if numbers > most:
+                raise SimulationError(
+                    f"particles are spread over {nodes} nodes, those of a block over {part}, which "
+                    f"takes {numbers:.3g} numbers, more than {most:.3g}",
+                    step,
+                    -1,
+                    (math.nan, math.nan),
+                    "let no part of the body fly away: take a smaller time step (now "
+                    f"{self.simulation.scene.time_step:g}), weaker actuation, or a smaller grid",
+                )
+        self.resize(nodes, part)
+
+    def resize(self, nodes: int, part: int) -> None:
+        """Make room for windows of so many nodes, and so many in a block's, keeping the grids."""
+        kept, fields = self.grids, self.simulation.fields
+        shape = (len(kept), fields, nodes, kernels.NODE_SIZE)
+        if kept.size == 0:
+            self.grids = self.memory.take("grids", shape, kept.dtype)
+        else:
+            self.grids = np.empty(shape, kept.dtype)
+            self.grids[:, :, : kept.shape[2]] = kept
+        self.scratch = kernels.Scratch.make(fields, nodes, self.blocks, part, kept.dtype)
+
+    def advance(self, first: int, last: int) -> None:
+        """Advance from step `first`, whose state is in slot 0, to step `last`."""
+        simulation = self.simulation
+        signal = simulation.signal[first:last]
+        reached, steps = 0, last - first
+        while reached < steps:
+            stop = min(steps, reached + simulation.steps_per_call)
+            reached, end, particle = in_parallel(
+                self.blocks,
+                kernels.advance,
+                self.states,
+                self.grids,
+                self.windows,
+                self.logs,
+                reached,
+                stop,
+                simulation.body,
+                simulation.world,
+                signal,
+                self.scratch,
+            )
+            nodes, part = self.grids.shape[2], self.scratch.parts.shape[2]
+            window = self.windows[reached % len(self.windows), :, 2:].prod(axis=1)
+            if end == kernels.WINDOW_TOO_SMALL:
+                self.reserve(int(1.25 * window[-1]), part, first + reached)
+            elif end == kernels.PART_TOO_SMALL:
+                self.reserve(nodes, int(1.25 * window[:-1].max()), first + reached)
+            elif end != kernels.DONE:
+                shape = simulation.initial.shape
+                particle = min(particle, shape[1] - 1)
+                state = kernels.ungrouped(self.states[reached % len(self.states)], *shape)
+                raise _failure(simulation, end, first + reached, particle, state)
+
+    def store(self, index: int, checkpoints: Checkpoints) -> None:
+        """Store the whole segment, or only its states if its windows outgrew their room."""
+        used = int(self.windows[:, -1, 2:].prod(axis=1).max())
+        if used > self.simulation.room[0]:
+            self.recomputed.add(index)
+            checkpoints.write(index, states=self.states)
+        else:
+            grids = self.grids[:, :, :used]
+            checkpoints.write(
+                index, states=self.states, grids=grids, windows=self.windows, logs=self.logs
+            )
+
+    def recall(self, index: int, first: int, last: int, checkpoints: Checkpoints) -> None:
+        """Bring the states and nodes of a segment back: read them, or recompute them."""
+        if not checkpoints.schedule.all_stored:
+            self.states[0] = kernels.grouped(checkpoints.read(index, "state"))
+            self.advance(first, last)
+            return
+        self.states[:] = checkpoints.read(index, "states")
+        if index in self.recomputed:
+            self.advance(first, last)
+        else:
+            self.windows[:] = checkpoints.read(index, "windows")
+            self.logs[:] = checkpoints.read(index, "logs")
+            grids = checkpoints.read(index, "grids")
+            self.grids[:, :, : grids.shape[2]] = grids
+
+
+def _failure(
+    simulation: Simulation, end: int, step: int, particle: int, state: NDArray
+) -> SimulationError:
+    x, y = (float(value) for value in np.real(kernels.parts(state).position[:, particle]))
+    if end == kernels.INVERTED:
+        what = "its deformation gradient is inverted"
+    elif not (np.isfinite(x) and np.isfinite(y)):
+        what = "its position is not a number"
+    else:
+        width, height = simulation.scene.grid.size
+        margin = simulation.world.dx / 2
+        what = (
+            f"it left the grid ({margin:g} to {width - margin:g} by {margin:g} to "
+            f"{height - margin:g})"
+        )
+    scene = simulation.scene
+    hint = (
+        f"take a smaller time step (now {scene.time_step:g}, Courant {scene.courant:.2g}), a "
+        f"higher void density (now {scene.material.void_density:g}), weaker actuation"
+    )
+    if end == kernels.ESCAPED:
+        hint += ", or a larger grid"
+    return SimulationError(what, step, particle, (x, y), hint)

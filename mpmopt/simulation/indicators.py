@@ -1,0 +1,107 @@
+"""How close a run comes to where its time step is too long, or its body tears."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpmopt import kernels
+from mpmopt.errors import DesignError
+from mpmopt.simulation.energy import Balance
+from mpmopt.validation import shown
+
+if TYPE_CHECKING:
+    from mpmopt.simulation.simulation import Simulation
+
+# States are looked at for their indicators once in so many steps, and at the end.
+WATCH = 16
+
+
+class Indicators(NamedTuple):
+    """How close a run came to where its step is too long: extremes over particles and steps.
+
+    States 0, 16, 32, ... and the last one are looked at. Real parts count.
+
+    Attributes
+    ----------
+    courant : float
+        Largest (dt / dx) sqrt(M / rho) with the stiffness M of the stretched particle. An isolated
+        particle is unstable above 1.
+    velocity_increment : float
+        Largest dt |C|, the Frobenius norm. Below 1 no particle can be inverted by a step.
+    jacobian : float
+        Smallest J = det F.
+    stretch : float
+        Largest singular value of F among particles with half the solid's stiffness or more. Solid
+        is torn where it exceeds the particles per cell and direction by far.
+    energy : float
+        Most that energy rose without work, as a share of what the run had to do with
+        (`energy.Balance`). No law of motion allows any.
+    """
+
+    courant: float = 0.0
+    velocity_increment: float = 0.0
+    jacobian: float = math.inf
+    stretch: float = 0.0
+    energy: float = 0.0
+
+    def join(self, other: Indicators) -> Indicators:
+        """The indicators of two runs, or of two parts of a run, taken together."""
+        return Indicators(
+            max(self.courant, other.courant),
+            max(self.velocity_increment, other.velocity_increment),
+            min(self.jacobian, other.jacobian),
+            max(self.stretch, other.stretch),
+            max(self.energy, other.energy),
+        )
+
+
+class Watched(NamedTuple):
+    """How a run ended.
+
+    Attributes
+    ----------
+    states : dict of int to (12, N) array
+        The states after so many steps: those that were asked for, and the last.
+    indicators : Indicators
+    """
+
+    states: dict[int, NDArray]
+    indicators: Indicators
+
+
+class Watcher:
+    """What is seen of a run: its indicators so far, and the states that were asked for."""
+
+    def __init__(self, simulation: Simulation, instants: Collection[int]) -> None:
+        steps = simulation.steps
+        for step in instants:
+            if not isinstance(step, (int, np.integer)) or not 0 <= step <= steps:
+                raise DesignError(
+                    f"instants must be whole numbers of steps from 0 to {steps}, got {shown(step)}"
+                )
+        self._wanted = {int(step) for step in (*instants, steps)}
+        self.states: dict[int, NDArray] = {}
+        self.simulation, self._seen = simulation, Indicators()
+        self._balance = Balance(simulation.body, simulation.world, simulation.signal)
+
+    def follow(self, states: NDArray, first: int, last: int) -> None:
+        """Look at steps `first` to `last`, whose states are in slots 0, 1, ..."""
+        self._balance.follow(states, first, last)
+        for step in sorted(self._wanted - set(self.states)):
+            if first <= step <= last:
+                shape = self.simulation.initial.shape
+                self.states[step] = kernels.ungrouped(states[step - first], *shape)
+        slots = [*range(-first % WATCH, last - first, WATCH)]
+        if last == self.simulation.steps:
+            slots.append(last - first)
+        for slot in slots:
+            self._seen = self._seen.join(self.simulation.indicators(states[slot]))
+
+    @property
+    def indicators(self) -> Indicators:
+        return self._seen._replace(energy=self._balance.appeared)

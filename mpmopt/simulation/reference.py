@@ -1,0 +1,120 @@
+"""One step as its equations say it, node by node: what `mpmopt.kernels` do, slowly.
+
+The kernels sum over nodes by polynomials of cells, in groups of four particles and blocks of them.
+Tests hold them against this, which shares no arithmetic with them.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpmopt.kernels import parts, ungrouped
+from mpmopt.scene import Scene
+from mpmopt.simulation.simulation import Simulation
+
+
+def step(simulation: Simulation, state: NDArray, n: int) -> NDArray:
+    """The state after step n, of a scene without a mirror.
+
+    Parameters
+    ----------
+    simulation : Simulation
+    state : (12, N) array
+        At the start of the step; real or complex.
+    n : int
+        Number of the step, for the signal.
+
+    Returns
+    -------
+    (12, N) array
+    """
+    scene, body, count = simulation.scene, simulation.body, state.shape[1]
+    dt, dx = scene.time_step, scene.grid.dx
+    constants = (body.volume, body.mass, body.lame_lambda, body.lame_mu)
+    V, m, la, mu = (ungrouped(values, 1, count)[0] for values in constants)
+    x, v, C, F = parts(state)
+    I = np.eye(2)[:, :, None]  # noqa: E741
+
+    # deform
+    F = product(I + dt * C, F)
+    J = F[0, 0] * F[1, 1] - F[0, 1] * F[1, 0]
+
+    # stress
+    sS = np.zeros_like(F)
+    for k, actuator in enumerate(scene.actuators):
+        there = simulation.particles.actuator == k
+        sS = sS + simulation.signal[n, k] * there * np.array(actuator.stress)[:, :, None]
+    FT = F.transpose(1, 0, 2)
+    tau = mu * (product(F, FT) - I) + la * np.log(J) * I + product(product(F, sS), FT)
+    A = m * C - dt * V * (4.0 / dx**2) * tau
+
+    # particle to grid
+    base = np.floor(x.real / dx - 0.5).astype(int)
+    stencil = []
+    for a in range(3):
+        for b in range(3):
+            i, j = base[0] + a, base[1] + b
+            d = np.stack([i, j]) * dx - x
+            stencil.append((i, j, spline(d[0] / dx) * spline(d[1] / dx), d))
+    nodes = tuple(cells + 1 for cells in scene.grid.cells)
+    mass = np.zeros(nodes, state.dtype)
+    q, q_old = np.zeros((2, *nodes), state.dtype), np.zeros((2, *nodes), state.dtype)
+    for i, j, w_i, d in stencil:
+        np.add.at(mass, (i, j), w_i * m)
+        for k in (0, 1):
+            np.add.at(q[k], (i, j), w_i * (m * v[k] + A[k, 0] * d[0] + A[k, 1] * d[1]))
+            np.add.at(q_old[k], (i, j), w_i * m * (v[k] + C[k, 0] * d[0] + C[k, 1] * d[1]))
+
+    # grid update
+    u, u_old = np.zeros_like(q), np.zeros_like(q)
+    for i, j in zip(*np.nonzero(mass.real > 0.0)):
+        u[:, i, j] = q[:, i, j] / mass[i, j] + dt * np.array(scene.gravity)
+        meet_walls(scene, np.array([i, j]) * dx, u[:, i, j])
+        u_old[:, i, j] = q_old[:, i, j] / mass[i, j]
+
+    # grid to particle, and blend
+    new = np.zeros_like(state)
+    x_new, v_new, C_new, F_new = parts(new)
+    lost = v.copy()
+    for i, j, w_i, d in stencil:
+        v_new += w_i * u[:, i, j]
+        C_new += (4.0 / dx**2) * w_i * u[:, None, i, j] * d
+        lost = lost - w_i * u_old[:, i, j]
+    x_new[:] = x + dt * v_new
+    if scene.blend_time > 0.0:
+        v_new += np.exp(-dt / scene.blend_time) * lost
+    F_new[:] = F
+    return new
+
+
+def spline(r: NDArray) -> NDArray:
+    """Quadratic B-spline at distances r, in cells, from its middle."""
+    r = np.where(r.real < 0.0, -r, r)
+    return np.where(r.real < 0.5, 0.75 - r**2, np.where(r.real < 1.5, 0.5 * (1.5 - r) ** 2, 0.0))
+
+
+def meet_walls(scene: Scene, place: NDArray[np.float64], u: NDArray) -> None:
+    """Change the velocity u (2,) of a node at a place (2,) where it approaches a wall before it.
+
+    Coulomb: the wall takes the normal velocity, and of the tangential one no more than the friction
+    coefficient times as much.
+    """
+    for wall in scene.walls:
+        normal = "xy".index(wall.axis)
+        outward = 1.0 if wall.solid_side == "below" else -1.0
+        depth = outward * (wall.position - place[normal])
+        approach = -outward * u[normal]
+        if depth > 1e-3 * scene.grid.dx and approach.real > 0.0:
+            sliding = u[1 - normal]
+            speed = sliding if sliding.real > 0.0 else -sliding
+            left = 0.0 * speed
+            if wall.friction != "stick" and speed.real >= wall.friction * approach.real:
+                left = speed - wall.friction * approach
+            u[1 - normal] = left if sliding.real > 0.0 else -left
+            u[normal] = 0.0
+
+
+def product(a: NDArray, b: NDArray) -> NDArray:
+    """Products of tensors (2, 2, N)."""
+    return np.einsum("ijp,jkp->ikp", a, b)

@@ -1,0 +1,427 @@
+"""Forward and reverse loops over the steps of one body in one scene."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+from typing import Literal
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from mpmopt import kernels
+from mpmopt.errors import DesignError
+from mpmopt.scene import Scene
+from mpmopt.scene.particles import Particles
+from mpmopt.simulation.buffers import Memory, Segment
+from mpmopt.simulation.checkpoints import Checkpointing, Checkpoints, Schedule
+from mpmopt.simulation.indicators import WATCH, Indicators, Watched, Watcher
+from mpmopt.simulation.surroundings import world_of
+from mpmopt.simulation.threads import in_parallel
+from mpmopt.validation import shown
+
+Precision = Literal["double", "single"]
+
+# Kernels return to Python after so many steps times particles, so that signals are heard in time.
+WORK_PER_CALL = 500_000
+# Particles in a block, at least, and blocks, at most. They, and with them the order in which nodes
+# are summed, do not depend on the number of threads.
+BLOCK, BLOCKS = 400, 64
+
+
+def check_precision(precision: Precision) -> Precision:
+    """`precision`, or a DesignError."""
+    if precision not in ("double", "single"):
+        raise DesignError(f'precision = {shown(precision)} must be "double" or "single"')
+    return precision
+
+
+@dataclass(frozen=True)
+class Gradient:
+    """Derivatives of the objective with respect to a simulation's inputs.
+
+    Attributes
+    ----------
+    density, lame_lambda, lame_mu : (N,) arrays
+    signal : (steps, K) array
+    state : (12, N) array
+        With respect to the initial state.
+    """
+
+    density: NDArray[np.float64]
+    lame_lambda: NDArray[np.float64]
+    lame_mu: NDArray[np.float64]
+    signal: NDArray[np.float64]
+    state: NDArray[np.float64]
+
+
+class Simulation:
+    """One body, its material and its actuators' signals, ready to run.
+
+    Parameters
+    ----------
+    scene : Scene
+        Grid, time, walls, gravity, and the actuators' stresses.
+    particles : Particles
+        N of them.
+    density, lame_lambda, lame_mu : (N,) arrays
+        Real, or complex for the complex step.
+    signal : (steps, K) array
+        Of the scene's K actuators; real or complex.
+    state : (12, N) array, optional
+        Initial state (layout: `mpmopt.kernels`); default: at rest and undeformed.
+    precision : {"double", "single"}, optional
+        Of all numbers. Single is for looks ahead: its gradients lose digits with every step.
+
+    Raises
+    ------
+    DesignError
+        If shapes do not fit, or a value is not finite or not positive where it must be.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        particles: Particles,
+        density: NDArray,
+        lame_lambda: NDArray,
+        lame_mu: NDArray,
+        signal: NDArray,
+        state: NDArray | None = None,
+        precision: Precision = "double",
+    ) -> None:
+        check_precision(precision)
+        count = len(particles.position)
+        if state is None:
+            state = np.zeros((kernels.STATE_SIZE, count))
+            x, _, _, F = kernels.parts(state)
+            x[:], F[0, 0], F[1, 1] = particles.position.T, 1.0, 1.0
+        shapes = {
+            "density": (density, (count,)),
+            "lame_lambda": (lame_lambda, (count,)),
+            "lame_mu": (lame_mu, (count,)),
+            "signal": (signal, (scene.steps, len(scene.actuators))),
+            "state": (state, (kernels.STATE_SIZE, count)),
+        }
+        for name, (array, shape) in shapes.items():
+            if np.shape(array) != shape:
+                raise DesignError(f"{name} has shape {np.shape(array)}, must have {shape}")
+            kind = np.asarray(array).dtype
+            if kind.kind not in "fciu":
+                raise DesignError(f"{name} holds {kind}, must hold numbers")
+            if np.ma.is_masked(array):
+                raise DesignError(f"{name} has masked entries, which have no value; fill them")
+            if not np.all(np.isfinite(array)):
+                raise DesignError(f"{name} holds {np.sum(~np.isfinite(array))} values not finite")
+        if count == 0:
+            raise DesignError("the body has no particles")
+        dtype = np.result_type(density, lame_lambda, lame_mu, signal, state, float)
+        if precision == "single" and dtype.kind == "f":
+            dtype = np.dtype(np.float32)
+        if not np.real(density).min() > 0.0:
+            raise DesignError(f"density {np.real(density).min():g} must be above 0")
+        real = np.empty(0, dtype).real.dtype
+        self.scene = scene
+        self.particles = particles
+        # A node's mass is a sum that cancels, so the least of it is rounding of a particle's.
+        heaviest = float((particles.volume * np.real(density)).max())
+        mass_tolerance = 8.0 * np.finfo(real).eps * heaviest
+        self.world = world_of(scene)._replace(mass_tolerance=mass_tolerance)
+        actuator = kernels.grouped(particles.actuator)
+        stress = [(S[0][0], S[0][1], S[1][1]) for S in (a.stress for a in scene.actuators)]
+        self.body = kernels.Body(
+            volume=kernels.grouped(particles.volume.astype(dtype), repeat=False),
+            mass=kernels.grouped((particles.volume * density).astype(dtype), repeat=False),
+            lame_lambda=kernels.grouped(np.asarray(lame_lambda, dtype=dtype)),
+            lame_mu=kernels.grouped(np.asarray(lame_mu, dtype=dtype)),
+            active=np.any(actuator >= 0, axis=1),
+            actuated=(actuator == np.arange(len(stress))[:, None, None]).astype(real),
+            actuation_stress=np.array(stress, dtype=float).reshape(-1, 3),
+            first=np.linspace(
+                0, -(-count // 4), min(max(count // BLOCK, 1), BLOCKS) + 1, dtype=np.int64
+            ),
+        )
+        self.signal = np.array(signal, dtype=dtype, order="C")
+        self.initial = np.array(state, dtype=dtype, order="C")
+
+    def run(self, frames: Sequence[int] | None = None) -> NDArray:
+        """Run forward and keep nothing.
+
+        Parameters
+        ----------
+        frames : sequence of int, optional
+            Increasing numbers of steps after which the state is wanted, 0 for the initial one.
+
+        Returns
+        -------
+        (12, N) array, the final state; or (len(frames), 12, N) array
+
+        Raises
+        ------
+        SimulationError
+            If a particle leaves the grid, inverts, or is not a number.
+        """
+        wanted = [self.scene.steps] if frames is None else list(frames)
+        whole = all(isinstance(frame, (int, np.integer)) for frame in wanted)
+        ends = [0, *wanted, self.steps]
+        if not whole or ends != sorted(ends):
+            raise DesignError(
+                f"frames must be whole numbers that increase from 0 to {self.steps}, got "
+                f"{shown(wanted)}"
+            )
+        memory = Segment(self, 1, Memory())
+        states = memory.states
+        states[0] = kernels.grouped(self.initial)
+        kept = []
+        step = 0
+        for frame in wanted:
+            while step < frame:
+                last = min(frame, step + self.steps_per_call)
+                memory.advance(step, last)
+                states[0] = states[(last - step) % 2]
+                step = last
+            kept.append(kernels.ungrouped(states[0], *self.initial.shape))
+        return kept[-1] if frames is None else np.array(kept)
+
+    def watch(self, instants: Collection[int] = ()) -> Watched:
+        """Run forward: how the run ends, and how close it came to failure.
+
+        Parameters
+        ----------
+        instants : collection of int, optional
+            Numbers of steps after which the state is wanted besides the last, 0 for the initial.
+
+        Raises
+        ------
+        DesignError
+            If an instant is none.
+        SimulationError
+            As `run`.
+        """
+        memory = Segment(self, min(WATCH, self.steps), Memory())
+        memory.states[0] = kernels.grouped(self.initial)
+        watcher = Watcher(self, instants)
+        for first in range(0, self.steps, WATCH):
+            last = min(first + WATCH, self.steps)
+            memory.advance(first, last)
+            watcher.follow(memory.states, first, last)
+            memory.states[0] = memory.states[last - first]
+        return Watched(watcher.states, watcher.indicators)
+
+    def indicators(self, records: NDArray) -> Indicators:
+        """Those of a state, as records of groups of particles (`grouped`), but for energy."""
+        solid = 0.5 * self.scene.material.lame_mu
+        found = kernels.indicators(records, self.body, self.world, solid, 0, len(self.body.mass))
+        return Indicators(*(float(value) for value in found))
+
+    @property
+    def fields(self) -> int:
+        """Sheets of nodes: two where particles keep a share of their own velocity, else one."""
+        return 2 if self.world.keep > 0.0 else 1
+
+    @property
+    def steps(self) -> int:
+        """Number of steps."""
+        return self.scene.steps
+
+    @property
+    def steps_per_call(self) -> int:
+        """Steps that the kernels make before they return to Python."""
+        return 1 + WORK_PER_CALL // self.initial.shape[1]
+
+    @cached_property
+    def room(self) -> tuple[int, int]:
+        """Records to start with, of the body's nodes and of a block's.
+
+        The initial windows with a quarter to spare on each axis.
+        """
+        position = np.real(kernels.parts(self.initial).position)
+        most = (self.world.nodes_x, self.world.nodes_y)
+
+        def nodes(first: int, last: int) -> int:
+            cells = np.fmin(np.ptp(position[:, first:last], axis=1) / self.world.dx, most)
+            return int(np.prod(np.ceil(1.25 * cells) + 4))
+
+        first = 4 * self.body.first
+        blocks = max(nodes(a, b) for a, b in pairwise(first))
+        return nodes(0, position.shape[1]), blocks
+
+    def checkpoints(self, wish: Checkpointing) -> Checkpoints:
+        """A store for `forward`, with the schedule that the wish and the body's size ask for.
+
+        It holds of each segment the state (12, N) at its start; or, where all are kept, what
+        `kernels.advance` leaves of its steps.
+
+        Raises
+        ------
+        StorageError
+            If the disk has too little room.
+        """
+        groups, dtype = self.body.mass.shape[0], self.initial.dtype
+        states, log = (kernels.STATE_SIZE * groups, 4), (groups, 4)
+        nodes, _ = self.room
+        grid = (self.fields, nodes, kernels.NODE_SIZE)
+        numbers = math.prod(states) + math.prod(log) + math.prod(grid)
+        step_bytes = numbers * dtype.itemsize
+        schedule = Schedule.choose(self.steps, step_bytes, wish)
+        length = schedule.segment
+        arrays: dict[str, tuple[tuple[int, ...], DTypeLike]] = {
+            "state": (self.initial.shape, dtype)
+        }
+        if schedule.all_stored:
+            arrays = {
+                "states": ((length + 1, *states), dtype),
+                "grids": ((length, *grid), dtype),
+                "windows": ((length, len(self.body.first), 4), np.int64),
+                "logs": ((length, *log), dtype),
+            }
+        return Checkpoints(schedule, arrays, wish.store)
+
+    def forward(
+        self,
+        checkpoints: Checkpoints,
+        memory: Memory | None = None,
+        instants: Collection[int] = (),
+    ) -> Forward:
+        """Run forward, storing what the checkpoints' schedule asks for.
+
+        Parameters
+        ----------
+        checkpoints : Checkpoints
+        memory : Memory, optional
+            Of an earlier run whose gradient was taken.
+        instants : collection of int, optional
+            As in `watch`.
+
+        Raises
+        ------
+        DesignError
+            If an instant is none.
+        SimulationError
+            As `run`.
+        """
+        schedule = checkpoints.schedule
+        segment = Segment(self, schedule.segment, memory or Memory())
+        segment.states[0] = kernels.grouped(self.initial)
+        watcher = Watcher(self, instants)
+        for index, (first, last) in enumerate(schedule.segments):
+            if not schedule.all_stored:
+                state = kernels.ungrouped(segment.states[0], *self.initial.shape)
+                checkpoints.write(index, state=state)
+            segment.advance(first, last)
+            watcher.follow(segment.states, first, last)
+            if last < schedule.steps:
+                if schedule.all_stored:
+                    segment.store(index, checkpoints)
+                segment.states[0] = segment.states[last - first]
+        return Forward(self, checkpoints, segment, watcher)
+
+
+class Forward:
+    """A forward run that is ready to be gone back through.
+
+    Attributes
+    ----------
+    states : dict of int to (12, N) array
+        The states after so many steps: those that were asked for, and the last.
+    indicators : Indicators
+    """
+
+    def __init__(
+        self,
+        simulation: Simulation,
+        checkpoints: Checkpoints,
+        memory: Segment,
+        watcher: Watcher,
+    ) -> None:
+        self.states, self.indicators = watcher.states, watcher.indicators
+        self._simulation, self._checkpoints, self._memory = simulation, checkpoints, memory
+        self._reversed = False
+
+    @property
+    def recomputed_segments(self) -> int:
+        """Segments that `reverse` recomputes."""
+        schedule = self._checkpoints.schedule
+        if schedule.all_stored:
+            return len(self._memory.recomputed)
+        return len(schedule.segments) - 1
+
+    def reverse(self, seeds: Mapping[int, NDArray[np.float64]]) -> Gradient:
+        """Go back through all steps from a function's derivatives by states.
+
+        Parameters
+        ----------
+        seeds : mapping of int to (12, N) array
+            Derivatives by the states after so many steps, any of them from 0 to the last.
+
+        Raises
+        ------
+        DesignError
+            If there is no such step or a shape is wrong; if called a second time, as going back
+            overwrites what it needs; or if another run was given the same memory meanwhile.
+        StorageError
+            If a checkpoint cannot be read back.
+        """
+        if self._reversed:
+            raise DesignError("this run was gone back through already; run forward again")
+        if self._memory.memory.runs != self._memory.run:
+            raise DesignError("another run took this one's memory; give each run its own")
+        simulation, memory = self._simulation, self._memory
+        schedule = self._checkpoints.schedule
+        shape, dtype = simulation.initial.shape, simulation.initial.dtype
+        for step, seed in seeds.items():
+            if not 0 <= step <= schedule.steps or np.shape(seed) != shape:
+                raise DesignError(
+                    f"seeds has shape {np.shape(seed)} at step {step}, must have {shape} at steps "
+                    f"from 0 to {schedule.steps}"
+                )
+        self._reversed = True
+
+        def seed_of(step: int) -> NDArray:
+            seed = seeds[step] if step in seeds else np.zeros(shape)
+            return kernels.grouped(seed.astype(dtype), repeat=False)
+
+        bar = seed_of(schedule.steps)
+        body_bar = kernels.BodyBar.zeros(len(simulation.body.mass), dtype)
+        signal_bar = np.zeros_like(simulation.signal)
+        segments = schedule.segments
+        for index in range(len(segments) - 1, -1, -1):
+            first, last = segments[index]
+            if last < schedule.steps:
+                memory.recall(index, first, last, self._checkpoints)
+            part_bar = np.zeros((memory.blocks, *signal_bar[first:last].shape), dtype)
+            stop = last - first
+            while stop > 0:
+                earlier = (step - first for step in seeds if step < first + stop)
+                start = max(0, stop - simulation.steps_per_call, *earlier)
+                in_parallel(
+                    memory.blocks,
+                    kernels.advance_adjoint,
+                    memory.states,
+                    memory.grids,
+                    memory.windows,
+                    memory.logs,
+                    start,
+                    stop,
+                    simulation.body,
+                    simulation.world,
+                    simulation.signal[first:last],
+                    memory.scratch,
+                    bar,
+                    body_bar,
+                    part_bar,
+                )
+                stop = start
+                if first + start in seeds:
+                    bar += seed_of(first + start)
+            signal_bar[first:last] = part_bar.sum(axis=0)
+        return Gradient(
+            density=simulation.particles.volume * kernels.ungrouped(body_bar.mass, 1, shape[1])[0],
+            lame_lambda=kernels.ungrouped(body_bar.lame_lambda, 1, shape[1])[0],
+            lame_mu=kernels.ungrouped(body_bar.lame_mu, 1, shape[1])[0],
+            signal=signal_bar,
+            state=kernels.ungrouped(bar, *shape),
+        )

@@ -1,0 +1,32 @@
+"""A scene's surroundings as the kernels see them."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from mpmopt import kernels
+from mpmopt.kernels import contact
+from mpmopt.scene import Scene
+
+
+def world_of(scene: Scene) -> kernels.World:
+    """The scene's surroundings as the kernels see them."""
+    dx = scene.grid.dx
+    return kernels.World(
+        dt=scene.time_step,
+        dx=dx,
+        per_dx=1.0 / dx,
+        nodes_x=scene.grid.cells[0] + 1,
+        nodes_y=scene.grid.cells[1] + 1,
+        gravity_x=scene.gravity[0],
+        gravity_y=scene.gravity[1],
+        walls=np.array([wall.row(dx) for wall in scene.walls], dtype=float).reshape(
+            -1, len(contact.COLUMNS)
+        ),
+        mirror_axis=-1 if scene.mirror is None else scene.mirror.normal,
+        mirror_node=0 if scene.mirror is None else round(scene.mirror.position / dx),
+        keep=math.exp(-scene.time_step / scene.blend_time) if scene.blend_time else 0.0,
+        mass_tolerance=0.0,
+    )

@@ -1,0 +1,145 @@
+"""Pictures of a run: its scene, its bodies in motion, its history."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+from matplotlib.figure import Figure
+
+from mpmopt.assess.trajectory import Body, Motion, equal_steps, optimised, post_processed, reference
+from mpmopt.errors import SimulationError
+from mpmopt.io.files import replace_file
+from mpmopt.optimisation.history import Optimisation
+from mpmopt.view.draw import (
+    Squares,
+    draw_design,
+    draw_history,
+    draw_walls,
+    format_of,
+    new_figure,
+    own_style,
+    png,
+    set_view,
+    view,
+)
+from mpmopt.view.schematic import schematic
+
+logger = logging.getLogger(__name__)
+
+
+@own_style()
+def plot_motion(path: str | os.PathLike[str], body: Body, pictures: int = 8) -> None:
+    """Write a PNG of a body at equal intervals from start to end.
+
+    Parameters
+    ----------
+    path : Path
+    body : Body
+    pictures : int, optional
+
+    Raises
+    ------
+    SimulationError
+        If the body cannot be simulated.
+    StorageError
+        If the file cannot be written.
+    """
+    motion = Motion.of(body, equal_steps(body.simulation.scene, pictures))
+    box = view([motion])
+    width, height = box[1] - box[0]
+    columns, wide = (2, 5.0) if height < 1.25 * width else (4, 2.5)  # inches of a panel
+    columns = min(columns, pictures)
+    rows = -(-pictures // columns)
+    figure = new_figure(wide * columns, (wide * height / width + 0.35) * rows + 0.4)
+    name = body.name[0].upper() + body.name[1:]
+    figure.suptitle(f"{name}, L = {motion.objective[-1]:{format_of(motion.objective)}}")
+    panels = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).ravel()
+    for axes in panels[pictures:]:
+        axes.set_axis_off()
+    times = motion.frames * motion.scene.time_step
+    for number, (time, axes) in enumerate(zip(times, panels)):
+        set_view(axes, box)
+        draw_walls(axes, motion.scene, moving=True)
+        axes.add_collection(Squares(motion, number), autolim=False)
+        axes.set_title(f"t = {time:{format_of(times)}}", fontsize=9)
+        axes.tick_params(labelsize=7)
+    replace_file(path, png(figure))
+
+
+@own_style()
+def plot_history(path: str | os.PathLike[str], run: Optimisation) -> None:
+    """Write a PNG of objective, beta and non-discreteness over a run's evaluations, stages marked.
+
+    Raises
+    ------
+    StorageError
+        If the file cannot be written.
+    """
+    figure = new_figure(7.0, 4.5)
+    axes = figure.add_subplot()
+    draw_history(axes, run)
+    axes.set_title("History of the optimisation", pad=32.0)
+    replace_file(path, png(figure))
+
+
+@own_style()
+def overview(run: Optimisation) -> Figure:
+    """A figure of a run's best design before it moves, beside the history that led to it."""
+    figure = new_figure(12.0, 4.0)
+    left, right = figure.subplots(1, 2)
+    draw_design(left, run.problem(), run.result.x)
+    draw_history(right, run)
+    return figure
+
+
+PICTURES: dict[str, Callable[[Path, Optimisation], None]] = {
+    "schematic": lambda path, run: replace_file(path, png(schematic(run.scene))),
+    "history": lambda path, run: plot_history(path, run),
+    "design": lambda path, run: plot_motion(path, optimised(run.problem(), run.result.x)),
+    "post_processed": lambda path, run: plot_motion(
+        path, post_processed(run.problem(), run.result.x)
+    ),
+    "reference": lambda path, run: plot_motion(path, reference(run.problem(), run.result.x)),
+}
+
+
+def picture_files(folder: Path) -> dict[str, Path]:
+    """The files that `plot_run` writes to a folder, by name."""
+    return {name: folder / f"{name}.png" for name in PICTURES}
+
+
+def plot_run(
+    folder: Path, run: Optimisation, progress: Callable[[Path], None] | None = None
+) -> None:
+    """Write all pictures of a run to a folder.
+
+    ``schematic.png`` shows the scene, ``design.png``, ``post_processed.png`` and ``reference.png``
+    bodies in motion (`motion`), and ``history.png`` the optimisation. A body that cannot be
+    simulated has no picture.
+
+    Parameters
+    ----------
+    folder : Path
+    run : Optimisation
+    progress : callable, optional
+        Called with the path of each picture that was written.
+
+    Raises
+    ------
+    DesignError
+        If the run has no design.
+    StorageError
+        If a file cannot be written.
+    """
+    run.problem()  # an error before anything is written
+    for name, path in picture_files(folder).items():
+        try:
+            PICTURES[name](path, run)
+        except SimulationError as error:
+            logger.warning("no %s: %s", path.name, error)
+            continue
+        if progress is not None:
+            progress(path)
