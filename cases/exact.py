@@ -10,7 +10,7 @@ from mpmopt.scene import Grid, Material, Mirror, Scene, Solid
 from mpmopt.scene.particles import discretise
 from mpmopt.simulation.checkpoints import Checkpointing
 from mpmopt.simulation.simulation import Simulation
-from mpmopt.simulation.surroundings import world_of
+from mpmopt.simulation.surroundings import parameters_of
 
 
 def solid_simulation(scene, particles=None, state=None, precision="double"):
@@ -124,7 +124,7 @@ def manufactured_error(n, amplitude, courant=0.2, per_cell=2):
     )  # fmt: skip
     particles = discretise(scene)
     simulation = solid_simulation(scene, particles)
-    body, world = simulation.body, world_of(scene)
+    data, parameters = simulation.data, parameters_of(scene)
     X = particles.position.T - offset
     sine, cosine = np.sin(np.pi * X), np.cos(np.pi * X)
 
@@ -143,7 +143,7 @@ def manufactured_error(n, amplitude, courant=0.2, per_cell=2):
     old[2:4] = amplitude * sine * rate
     old[4], old[7] = amplitude * np.pi * cosine * rate
     old[8], old[11] = 1.0 / (1.0 + dt * old[4]), 1.0 / (1.0 + dt * old[7])
-    shape, groups, side = old.shape, len(body.mass), n + 7
+    shape, groups, side = old.shape, len(data.mass), n + 7
     every, window = (0, groups), (0, 0, side, side)
     old = kernels.grouped(old)
     new = old.copy()
@@ -156,18 +156,18 @@ def manufactured_error(n, amplitude, courant=0.2, per_cell=2):
         push = dt * force(step * dt)
         old[2::12] += kernels.grouped(push[:1])
         old[3::12] += kernels.grouped(push[1:])
-        kernels.deform(old, new, world, log_J, *every)
-        kernels.locate(old, world, window, tile, *every)
-        kernels.stress(old, new, log_J, body, world, np.zeros(0), tile, *every)
+        kernels.deform(old, new, parameters, log_J, *every)
+        kernels.locate(old, parameters, window, tile, *every)
+        kernels.stress(old, new, log_J, data, parameters, np.zeros(0), tile, *every)
         cells[:] = 0.0
-        kernels.p2g(old, body, tile, cells, *every)
+        kernels.p2g(old, data, tile, cells, *every)
         kernels.taylor_adjoint(cells, window, grid)
         mirror(grid.reshape(side, side, 4), 0, n)
         mirror(grid.reshape(side, side, 4).transpose(1, 0, 2), 1, n)
         for column in range(side):
-            kernels.grid_update(nodes, window, world, velocity, column)
+            kernels.grid_update(nodes, window, parameters, velocity, column)
         kernels.taylor(velocity[0], window, window, velocity_cells)
-        kernels.g2p(old, new, world, tile, velocity_cells, *every)
+        kernels.g2p(old, new, parameters, tile, velocity_cells, *every)
         old, new = new, old
         u, _ = exact((step + 1) * dt)
         error = kernels.ungrouped(old, *shape)[0:2] - offset - X - u

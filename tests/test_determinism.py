@@ -26,7 +26,7 @@ def short_run(checkpointing=None):
     stages = tuple(Stage(beta, 1e-2, 1e-3, 8e-4, solid=beta > 1.0) for beta in (1.0, 4.0))
     settings = Settings(stages, window=1, least_iterations=3, most_iterations=3)
     problem = Problem(stages[0].scene(scene))
-    assert len(problem.simulation(np.zeros(problem.size)).body.first) - 1 >= 2  # blocks
+    assert len(problem.simulation(np.zeros(problem.size)).data.first) - 1 >= 2  # blocks
     start = problem.join(0.0, 1.0, -0.3, -0.5)
     run = optimise(scene, settings, start, checkpointing=checkpointing)
     return [

@@ -27,9 +27,9 @@ def totals(simulation, state):
     """Energy of a state, and what each actuator squeezes."""
     records = kernels.grouped(state)
     held = np.zeros((1, simulation.signal.shape[1]))
-    body, world = simulation.body, simulation.world
-    energy.grips(records[None], np.zeros(1, np.int64), body, world, held)
-    return sum(energy.energy(records, body, world)), held[0]
+    data, parameters = simulation.data, simulation.parameters
+    energy.grips(records[None], np.zeros(1, np.int64), data, parameters, held)
+    return sum(energy.energy(records, data, parameters)), held[0]
 
 
 def one_step(dt, rng):

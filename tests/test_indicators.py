@@ -241,7 +241,7 @@ def test_the_number_of_threads_changes_no_margin(monkeypatch):
     problem = Problem(walker(64, 8e-4).vary(void_density=1e-2), 2.0)
     problem.scene = dataclasses.replace(problem.scene, steps=40)
     simulation = problem.simulation(problem.join(0.0, 1.0, -0.3, -0.5))
-    assert len(simulation.body.first) - 1 >= 2  # blocks
+    assert len(simulation.data.first) - 1 >= 2  # blocks
     found = []
     for threads in ("1", "2"):
         monkeypatch.setenv("MPMOPT_THREADS", threads)

@@ -20,7 +20,7 @@ from mpmopt.scene import Actuator, Design, Grid, Scene, Solid, Wall
 from mpmopt.scene.particles import discretise
 from mpmopt.simulation.reference import step
 from mpmopt.simulation.simulation import Simulation
-from mpmopt.simulation.surroundings import world_of
+from mpmopt.simulation.surroundings import parameters_of
 
 
 def one_step(scene, state, signal=0.0, dtype=float):
@@ -31,13 +31,13 @@ def one_step(scene, state, signal=0.0, dtype=float):
         scene, particles, ones, 10.0 * ones, 10.0 * ones,
         np.full((scene.steps, len(scene.actuators)), signal), state,
     )  # fmt: skip
-    groups, nodes = len(simulation.body.mass), 400
+    groups, nodes = len(simulation.data.mass), 400
     states = np.zeros((2, kernels.STATE_SIZE * groups, 4), dtype)
     states[0] = kernels.grouped(state)
     grids = np.zeros((1, simulation.fields, nodes, kernels.NODE_SIZE), dtype)
     windows = np.zeros((1, 2, 4), np.int64)
     logs = np.zeros((1, groups, 4), dtype)
-    body, world = simulation.body, simulation.world
+    data, parameters = simulation.data, simulation.parameters
     scratch = kernels.Scratch.make(simulation.fields, nodes, 1, nodes, dtype)
     reached, end, particle = kernels.advance(
         states,
@@ -46,8 +46,8 @@ def one_step(scene, state, signal=0.0, dtype=float):
         logs,
         0,
         1,
-        body,
-        world,
+        data,
+        parameters,
         simulation.signal,
         scratch,
         np.zeros(24, np.int64),
@@ -58,9 +58,9 @@ def one_step(scene, state, signal=0.0, dtype=float):
     # A is dropped when nodes have it; the same kernel gives it again.
     tile = kernels.make_tile(groups, states)
     kernels.stress(
-        states[0], states[1], logs[0], body, world, simulation.signal[0], tile, 0, groups
+        states[0], states[1], logs[0], data, parameters, simulation.signal[0], tile, 0, groups
     )
-    affine = kernels.ungrouped(tile.affine, 4, state.shape[1]) / world.dx
+    affine = kernels.ungrouped(tile.affine, 4, state.shape[1]) / parameters.dx
     return kernels.ungrouped(states[1], *state.shape), grids[0, 0], windows[0, 1], affine
 
 
@@ -154,11 +154,11 @@ def test_particles_on_the_edge_of_two_cells_get_their_own_nodes_velocities(dx, p
 )
 def test_a_velocity_that_all_but_vanishes_has_the_sign_that_is_exact(rng):
     # Walls ask for it, forward and adjoint, so that neither may round it in its own way.
-    world = world_of(small_scene())
-    pull = world.dt * world.gravity_y
+    parameters = parameters_of(small_scene())
+    pull = parameters.dt * parameters.gravity_y
     for per_m in rng.uniform(1.0, 2.0, 200):
         q = -pull / per_m
-        found = kernels.free_velocity(np.array([[[q, q, 0.0, 0.0]]]), 0, per_m, world)[1]
+        found = kernels.free_velocity(np.array([[[q, q, 0.0, 0.0]]]), 0, per_m, parameters)[1]
         assert found == float(Fraction(q) * Fraction(per_m) + Fraction(pull))
 
 
@@ -268,12 +268,12 @@ def test_wall_law(wall, before, after):
 
 
 def world_with(wall):
-    """The world of a scene with one wall and a body out of its way."""
+    """The parameters of a scene with one wall and a body out of its way."""
     size = 1 / 16
     low = 0.75 if wall.solid_side == "below" else size
     where = (low, 0.5) if wall.axis == "x" else (0.5, low)
     body = (Solid(where, (where[0] + size, where[1] + size)),)
-    return world_of(small_scene(walls=(wall,), body=body))
+    return parameters_of(small_scene(walls=(wall,), body=body))
 
 
 def test_wall_clamps_the_nodes_strictly_behind_it():
@@ -283,10 +283,10 @@ def test_wall_clamps_the_nodes_strictly_behind_it():
         (Wall("y", 0.25, "above"), 5, 4),
         (Wall("y", 0.25 * (1.0 - 1e-9), "above"), 5, 4),
     ):
-        world = world_with(wall)
+        parameters = world_with(wall)
         into = -1.0 if wall.solid_side == "below" else 1.0
-        assert kernels.wall(7, behind, 0.0, into, world)[1] == 0.0
-        assert kernels.wall(7, before_it, 0.0, into, world)[1] == into
+        assert kernels.wall(7, behind, 0.0, into, parameters)[1] == 0.0
+        assert kernels.wall(7, before_it, 0.0, into, parameters)[1] == into
 
 
 def test_window_is_the_smallest_that_holds_all_touched_nodes(free, state):
@@ -303,8 +303,8 @@ def test_a_particle_off_the_grid_is_found_before_anything_is_written(free, state
         broken = state.copy()
         broken[axis, 5] = bad
         records, groups = kernels.grouped(broken), -(-state.shape[1] // 4)
-        assert not kernels.find_window(records, world_of(free), 0, groups)[4]
-        assert kernels.first_outside(records, world_of(free), 0, groups) == 5
+        assert not kernels.find_window(records, parameters_of(free), 0, groups)[4]
+        assert kernels.first_outside(records, parameters_of(free), 0, groups) == 5
 
 
 def test_complex_kernels_have_the_same_real_part(free, state):

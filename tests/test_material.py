@@ -37,8 +37,8 @@ def simulation(rng):
 
 def materials(simulation):
     """lambda, mu, m and V of the particles, and s S (2, 2, N)."""
-    body, count = simulation.body, simulation.initial.shape[1]
-    fields = (body.lame_lambda, body.lame_mu, body.mass, body.volume)
+    data, count = simulation.data, simulation.initial.shape[1]
+    fields = (data.lame_lambda, data.lame_mu, data.mass, data.volume)
     sS = np.zeros((2, 2, count))
     for k, actuator in enumerate(simulation.scene.actuators):
         there = simulation.particles.actuator == k
@@ -71,7 +71,7 @@ def test_the_stress_of_the_law_derives_from_its_energy(rng):
 
 def test_the_kirchhoff_stress_is_the_derivative_of_the_energy_density(simulation):
     (lam, mu, _, V), sS = materials(simulation)
-    body, world, count = simulation.body, simulation.world, simulation.initial.shape[1]
+    data, parameters, count = simulation.data, simulation.parameters, simulation.initial.shape[1]
     F = simulation.initial[8:12].reshape(2, 2, count)
     P = np.zeros_like(F)
     for i, j in np.ndindex(2, 2):
@@ -80,13 +80,13 @@ def test_the_kirchhoff_stress_is_the_derivative_of_the_energy_density(simulation
         P[i, j] = density(moved, lam, mu, sS).imag / COMPLEX_STEP
     expected = np.einsum("ikp,jkp->ijp", P, F)
 
-    records, groups = kernels.grouped(simulation.initial), len(body.mass)
+    records, groups = kernels.grouped(simulation.initial), len(data.mass)
     tile, log_J = kernels.make_tile(groups, records), np.zeros((groups, 4))
     new = records.copy()
-    assert kernels.deform(records, new, world, log_J, 0, groups)
-    kernels.stress(records, new, log_J, body, world, simulation.signal[0], tile, 0, groups)
-    affine = kernels.ungrouped(tile.affine, 4, count).reshape(2, 2, count) / world.dx
-    tau = -affine / (world.dt * V * 4.0 / world.dx**2)  # C = 0
+    assert kernels.deform(records, new, parameters, log_J, 0, groups)
+    kernels.stress(records, new, log_J, data, parameters, simulation.signal[0], tile, 0, groups)
+    affine = kernels.ungrouped(tile.affine, 4, count).reshape(2, 2, count) / parameters.dx
+    tau = -affine / (parameters.dt * V * 4.0 / parameters.dx**2)  # C = 0
     assert np.abs(tau - expected).max() <= 1e-13 * np.abs(expected).max()
 
 
@@ -95,7 +95,7 @@ def test_the_balance_counts_the_energy_that_the_stress_derives_from(simulation):
     F = simulation.initial[8:12].reshape(2, 2, -1)
     weight = m @ (np.array(simulation.scene.gravity) @ simulation.initial[0:2])
     kinetic, potential = energy.energy(
-        kernels.grouped(simulation.initial), simulation.body, simulation.world
+        kernels.grouped(simulation.initial), simulation.data, simulation.parameters
     )
     assert kinetic == 0.0
     assert potential == pytest.approx(V @ density(F, lam, mu, 0.0 * F) - weight, rel=1e-13)
@@ -104,9 +104,9 @@ def test_the_balance_counts_the_energy_that_the_stress_derives_from(simulation):
 def test_kinetic_energy_is_that_of_the_velocity_and_of_its_gradient(simulation, rng):
     # The affine momentum has the inertia m dx^2 / 4; F and x are taken half a step away.
     (lam, mu, m, V), _ = materials(simulation)
-    state, (dt, dx) = simulation.initial, simulation.world[:2]
+    state, (dt, dx) = simulation.initial, simulation.parameters[:2]
     state[2:8] = rng.uniform(-1.0, 1.0, (6, state.shape[1]))
-    found = energy.energy(kernels.grouped(state), simulation.body, simulation.world)
+    found = energy.energy(kernels.grouped(state), simulation.data, simulation.parameters)
     C, F = state[4:8].reshape(2, 2, -1), state[8:12].reshape(2, 2, -1)
     half = F + dt / 2.0 * np.einsum("ijp,jkp->ikp", C, F)
     at = state[0:2] - dt / 2.0 * state[2:4]
@@ -121,7 +121,7 @@ def test_what_actuators_squeeze_is_what_their_signals_multiply(simulation):
     (lam, mu, _, V), sS = materials(simulation)
     held = np.zeros((1, 2))
     records = kernels.grouped(simulation.initial)[None]
-    energy.grips(records, np.zeros(1, np.int64), simulation.body, simulation.world, held)
+    energy.grips(records, np.zeros(1, np.int64), simulation.data, simulation.parameters, held)
     F = simulation.initial[8:12].reshape(2, 2, -1)
     for k in (0, 1):
         own = np.where(simulation.particles.actuator == k, sS, 0.0) / simulation.signal[0, k]

@@ -20,7 +20,7 @@ from mpmopt.scene.particles import discretise
 from mpmopt.simulation.checkpoints import Checkpointing
 from mpmopt.simulation.reference import step
 from mpmopt.simulation.simulation import Simulation
-from mpmopt.simulation.surroundings import world_of
+from mpmopt.simulation.surroundings import parameters_of
 
 C = 1 / 16
 FRICTION = (0.0, 0.4, 1.5, "stick")
@@ -50,9 +50,9 @@ def wall_law(walls, node, velocity, seen=None):
 
 
 def world_with(*walls):
-    """The world of a scene with such walls at 4 or 12 cells, and a body between them."""
+    """The parameters of a scene with such walls at 4 or 12 cells, and a body between them."""
     body = (Solid((7 * C, 7 * C), (8 * C, 8 * C)),)
-    return world_of(small_scene(walls=walls, body=body))
+    return parameters_of(small_scene(walls=walls, body=body))
 
 
 def at(axis, side, friction):
@@ -61,18 +61,18 @@ def at(axis, side, friction):
 
 def check(walls, rng, samples, seen):
     """Velocities after the walls and their adjoint against `wall_law`, on all sides of them."""
-    world = world_with(*walls)
+    parameters = world_with(*walls)
     behind_or_not = itertools.product((2, 3, 4, 12, 13, 14), repeat=2)
     for node in behind_or_not:
         for _ in range(samples):
             v, bar = rng.standard_normal((2, 2))
             expected = wall_law(walls, node, v, seen)
-            assert np.abs(np.subtract(kernels.wall(*node, *v, world), expected)).max() <= 1e-15
+            assert np.abs(np.subtract(kernels.wall(*node, *v, parameters), expected)).max() <= 1e-15
             columns = [
                 np.imag(wall_law(walls, node, v + 1j * COMPLEX_STEP * direction)) / COMPLEX_STEP
                 for direction in np.eye(2)
             ]
-            found = kernels.wall_adjoint(*node, *v, world, *bar)
+            found = kernels.wall_adjoint(*node, *v, parameters, *bar)
             assert np.abs(found - np.array(columns) @ bar).max() <= 1e-14
 
 
@@ -87,11 +87,11 @@ def test_every_branch_of_a_wall_and_of_its_adjoint(rng):
 @pytest.mark.parametrize("axis", ["x", "y"])
 def test_without_friction_nothing_sticks_at_rest_either(axis):
     # Every body that starts at rest on such a wall asks for this derivative.
-    world = world_with(at(axis, "below", 0.0))
+    parameters = world_with(at(axis, "below", 0.0))
     rest = (-1.0 + 0.0j, 1j * COMPLEX_STEP)[:: 1 if axis == "x" else -1]
     along = (0.0, 1.0) if axis == "x" else (1.0, 0.0)
-    assert np.imag(kernels.wall(2, 2, *rest, world)) / COMPLEX_STEP == pytest.approx(along)
-    assert kernels.wall_adjoint(2, 2, *np.real(rest), world, 1.0, 1.0) == along
+    assert np.imag(kernels.wall(2, 2, *rest, parameters)) / COMPLEX_STEP == pytest.approx(along)
+    assert kernels.wall_adjoint(2, 2, *np.real(rest), parameters, 1.0, 1.0) == along
 
 
 @pytest.mark.parametrize("order", [1, -1])

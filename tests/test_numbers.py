@@ -19,7 +19,7 @@ from mpmopt.scene.particles import Particles, discretise
 from mpmopt.simulation.checkpoints import Checkpointing, Schedule
 from mpmopt.simulation.indicators import Indicators, Watched
 from mpmopt.simulation.simulation import Simulation
-from mpmopt.simulation.surroundings import world_of
+from mpmopt.simulation.surroundings import parameters_of
 
 
 def test_a_signal_is_that_of_the_start_of_each_step():
@@ -81,13 +81,13 @@ def test_the_kernels_know_the_walls_of_the_scene():
         ),
         blend_time=8e-3,
     )
-    world = world_of(scene)
-    assert world.walls[:, contact.AXIS].tolist() == [1, 0, 0]
-    assert world.walls[:, contact.SIDE].tolist() == [1, 1, -1]
-    assert world.walls[:, contact.NODE].tolist() == [4, 3, 12]
-    assert world.walls[:, contact.FRICTION].tolist() == [0.25, math.inf, 0.0]
-    assert world.keep == pytest.approx(math.exp(-0.5))
-    assert world_of(dataclasses.replace(scene, blend_time=0.0)).keep == 0.0
+    parameters = parameters_of(scene)
+    assert parameters.walls[:, contact.AXIS].tolist() == [1, 0, 0]
+    assert parameters.walls[:, contact.SIDE].tolist() == [1, 1, -1]
+    assert parameters.walls[:, contact.NODE].tolist() == [4, 3, 12]
+    assert parameters.walls[:, contact.FRICTION].tolist() == [0.25, math.inf, 0.0]
+    assert parameters.keep == pytest.approx(math.exp(-0.5))
+    assert parameters_of(dataclasses.replace(scene, blend_time=0.0)).keep == 0.0
 
 
 def test_margins_of_two_runs_are_the_worse_of_each():
@@ -156,10 +156,12 @@ def test_what_is_over_a_limit_is_tried_again_unless_it_is_torn_or_left_alone(
 def test_a_window_holds_the_mirror_images_of_its_nodes():
     # Nodes 8 to 12 along x and 3 to 5 along y.
     windows = np.array([[8, 3, 3, 2], [10, 4, 3, 2]])
-    world = world_of(small_scene())
+    parameters = parameters_of(small_scene())
 
     def window(axis, node):
-        return kernels.whole_window(windows, world._replace(mirror_axis=axis, mirror_node=node))
+        return kernels.whole_window(
+            windows, parameters._replace(mirror_axis=axis, mirror_node=node)
+        )
 
     assert window(-1, 0) == (8, 3, 5, 3)
     assert window(0, 9) == (6, 3, 7, 3)

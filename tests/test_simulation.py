@@ -130,13 +130,13 @@ def test_blocks_visit_hardly_more_nodes_than_the_whole_body():
     problem = Problem(scene)
     simulation = problem.simulation(problem.join(0.0, 1.0, -0.3, -0.5))
     nodes, part = simulation.room
-    blocks = len(simulation.body.first) - 1
+    blocks = len(simulation.data.first) - 1
     assert blocks == 8
     # The body covers 40 x 20 cells; a quarter more on each axis is kept free.
     assert nodes == (50 + 4) * (25 + 4)
     assert blocks * part <= 2.1 * nodes
     # Groups of four particles: no more than three are repeated to fill the last one.
-    assert 0 <= 4 * len(simulation.body.mass) - simulation.initial.shape[1] <= 3
+    assert 0 <= 4 * len(simulation.data.mass) - simulation.initial.shape[1] <= 3
 
 
 def test_a_body_that_flies_apart_takes_no_more_memory_than_there_is(scene):

@@ -24,7 +24,7 @@ jit_loop = njit(nogil=True)
 def evaluated(scene, every=20):
     problem = Problem(scene, 2.0, Checkpointing(every=every))
     x = np.random.default_rng(3).uniform(-0.8, 0.8, problem.size)
-    blocks = len(problem.simulation(x).body.first) - 1
+    blocks = len(problem.simulation(x).data.first) - 1
     return blocks, problem.value_and_gradient(x)
 
 
@@ -103,7 +103,7 @@ def test_a_failure_in_one_block_ends_all_threads(monkeypatch, particle):
     monkeypatch.setenv("MPMOPT_THREADS", "2")
     simulation, state = body_of()
     spoilt = simulation(state)
-    assert len(spoilt.body.first) - 1 == 6
+    assert len(spoilt.data.first) - 1 == 6
     spoilt.initial[8, particle] = -1.0  # inverted, in the first or the last block
     with pytest.raises(SimulationError, match="inverted") as caught:
         spoilt.run()

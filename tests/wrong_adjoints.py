@@ -40,7 +40,7 @@ FAULTS = {
     "mass of a node": ("-fused(v_bar, v, u_bar * u) * per_m", "-fused(v_bar, v, u_bar * u)"),
     "step in the velocity": ("v_bar + dt * x_bar)", "v_bar)"),
     "what the blend keeps": (
-        "store(bar, at(g, VELOCITY + axis), world.keep * v_bar)",
+        "store(bar, at(g, VELOCITY + axis), parameters.keep * v_bar)",
         "store(bar, at(g, VELOCITY + axis), none)",
     ),
     "what the blend takes": (
@@ -48,8 +48,8 @@ FAULTS = {
         "number(bar, at(g, VELOCITY), k)",
     ),
     "inertia of the affine velocity": (
-        "m = load(body.mass, g)\n    add(body_bar.mass",
-        "m = 0.0 * load(body.mass, g)\n    add(body_bar.mass",
+        "m = load(data.mass, g)\n    add(data_bar.mass",
+        "m = 0.0 * load(data.mass, g)\n    add(data_bar.mass",
     ),
     "pressure": ("t01 * h10 + pressure * f11", "t01 * h10 - pressure * f11"),
     "shear counted once": ("impulse * (a01 + a10)", "impulse * a01"),

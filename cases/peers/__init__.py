@@ -3,25 +3,27 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from mpmopt.kernels import World, contact, ungrouped
+from mpmopt.kernels import Parameters, contact, ungrouped
 from mpmopt.simulation.simulation import Simulation
 
 
 def window(simulation: Simulation) -> tuple[NDArray, NDArray]:
     """First node and size of a window of nodes that the body never leaves."""
     steps = simulation.steps
-    run = simulation.run(frames=range(0, steps + 1, 5))[:, 0:2].real / simulation.world.dx - 0.5
+    run = (
+        simulation.run(frames=range(0, steps + 1, 5))[:, 0:2].real / simulation.parameters.dx - 0.5
+    )
     low = run.min(axis=(0, 2)).astype(int) - 2
     high = run.max(axis=(0, 2)).astype(int) + 5
     return low, high - low
 
 
-def clamped(world: World) -> tuple[list[int], list[int]]:
+def clamped(parameters: Parameters) -> tuple[list[int], list[int]]:
     """First and last node along x and y that no wall clamps; only sticking walls are known."""
-    if world.mirror_axis >= 0 or not np.all(np.isinf(world.walls[:, contact.FRICTION])):
+    if parameters.mirror_axis >= 0 or not np.all(np.isinf(parameters.walls[:, contact.FRICTION])):
         raise NotImplementedError("only sticking walls and no mirror planes")
-    low, high = [0, 0], [world.nodes_x, world.nodes_y]
-    for row in world.walls:
+    low, high = [0, 0], [parameters.nodes_x, parameters.nodes_y]
+    for row in parameters.walls:
         axis, node = int(row[contact.AXIS]), int(row[contact.NODE])
         if row[contact.SIDE] > 0:
             low[axis] = max(low[axis], node)
@@ -32,7 +34,7 @@ def clamped(world: World) -> tuple[list[int], list[int]]:
 
 def constants(simulation: Simulation) -> tuple[NDArray, NDArray, NDArray, NDArray]:
     """Volume, mass, lambda and mu (N,) of the particles."""
-    body, count = simulation.body, simulation.initial.shape[1]
-    arrays = (body.volume, body.mass, body.lame_lambda, body.lame_mu)
+    data, count = simulation.data, simulation.initial.shape[1]
+    arrays = (data.volume, data.mass, data.lame_lambda, data.lame_mu)
     volume, mass, lame_lambda, lame_mu = (ungrouped(array, 1, count)[0] for array in arrays)
     return volume, mass, lame_lambda, lame_mu

@@ -55,16 +55,16 @@ class Peer:
 
 def prepare(simulation: Simulation, objective: Objective) -> Peer:
     """The scene of a simulation, ready to run in JAX."""
-    world, body = simulation.world, simulation.body
+    parameters, data = simulation.parameters, simulation.data
     N = simulation.initial.shape[1]
-    K = len(body.actuation_stress)
+    K = len(data.actuation_stress)
     low, size = window(simulation)
     i0, j0, ni, nj = int(low[0]), int(low[1]), int(size[0]), int(size[1])
     M = ni * nj
-    dt, dx = world.dt, world.dx
+    dt, dx = parameters.dt, parameters.dx
     inv, scale = 1 / dx, 4 / dx**2
-    gravity = dt * np.array([world.gravity_x, world.gravity_y])
-    lo, hi = clamped(world)
+    gravity = dt * np.array([parameters.gravity_x, parameters.gravity_y])
+    lo, hi = clamped(parameters)
     ii, jj = np.meshgrid(np.arange(i0, i0 + ni), np.arange(j0, j0 + nj), indexing="ij")
     below = np.stack([ii < lo[0], jj < lo[1]], -1).reshape(M, 2)
     above = np.stack([ii > hi[0], jj > hi[1]], -1).reshape(M, 2)
@@ -73,7 +73,7 @@ def prepare(simulation: Simulation, objective: Objective) -> Peer:
     impulse = dt * scale * volume
     actuator = simulation.particles.actuator
     onehot = (actuator == np.arange(K)[:, None]).astype(float)
-    S = body.actuation_stress
+    S = data.actuation_stress
     st = simulation.initial.real
     w_obj = objective.weight
     ex, ey = objective.direction

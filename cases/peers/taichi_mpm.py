@@ -31,16 +31,16 @@ class Peer:
 def prepare(simulation: Simulation, objective: Objective) -> Peer:
     """The scene of a simulation, ready to run in Taichi."""
     ti.init(arch=ti.cpu, default_fp=real, cpu_max_num_threads=2, offline_cache=False)
-    world, body, steps = simulation.world, simulation.body, simulation.steps
+    parameters, data, steps = simulation.parameters, simulation.data, simulation.steps
     N = simulation.initial.shape[1]
-    K = len(body.actuation_stress)
+    K = len(data.actuation_stress)
     low, size = window(simulation)
     i0, j0, rows = int(low[0]), int(low[1]), int(size[1])
     nodes = int(size[0] * size[1])
-    dt, dx = world.dt, world.dx
+    dt, dx = parameters.dt, parameters.dx
     inv, scale = 1 / dx, 4 / dx**2
-    gravity = ti.Vector([dt * world.gravity_x, dt * world.gravity_y])
-    lo, hi = clamped(world)
+    gravity = ti.Vector([dt * parameters.gravity_x, dt * parameters.gravity_y])
+    lo, hi = clamped(parameters)
     lox, loy = lo
     hix, hiy = hi
 
@@ -59,7 +59,7 @@ def prepare(simulation: Simulation, objective: Objective) -> Peer:
     C0 = ti.Matrix.field(2, 2, real, N)
     sums = ti.field(real, 2, needs_grad=True)
     result = ti.field(real, (), needs_grad=True)
-    S = [ti.Matrix([[s[0], s[1]], [s[1], s[2]]]) for s in body.actuation_stress]
+    S = [ti.Matrix([[s[0], s[1]], [s[1], s[2]]]) for s in data.actuation_stress]
     ex, ey = (float(d) for d in objective.direction)
 
     @ti.func

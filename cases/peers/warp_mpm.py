@@ -342,7 +342,7 @@ class Peer:
 
 def prepare(simulation: Simulation, objective: Objective) -> Peer:
     """The scene of a simulation, ready to run in Warp."""
-    world, body, steps = simulation.world, simulation.body, simulation.steps
+    parameters, data, steps = simulation.parameters, simulation.data, simulation.steps
     N = simulation.initial.shape[1]
     wp.set_device("cpu")
 
@@ -357,20 +357,20 @@ def prepare(simulation: Simulation, objective: Objective) -> Peer:
     mu = array(mus, real, True)
     signal = array(simulation.signal, real, True)
     actuator = array(simulation.particles.actuator, int)
-    stress = array(body.actuation_stress[:, [0, 1, 1, 2]].reshape(-1, 2, 2), mat22)
-    lo, hi = clamped(world)
+    stress = array(data.actuation_stress[:, [0, 1, 1, 2]].reshape(-1, 2, 2), mat22)
+    lo, hi = clamped(parameters)
     low, size = window(simulation)
     nodes = int(size[0] * size[1])
     setup = Setup()
-    setup.dt = world.dt
-    setup.dx = world.dx
-    setup.inverse_dx = 1 / world.dx
-    setup.scale = 4 / world.dx**2
+    setup.dt = parameters.dt
+    setup.dx = parameters.dx
+    setup.inverse_dx = 1 / parameters.dx
+    setup.scale = 4 / parameters.dx**2
     setup.first = wp.vec2i(int(low[0]), int(low[1]))
     setup.rows = int(size[1])
     setup.low = wp.vec2i(*lo)
     setup.high = wp.vec2i(*hi)
-    setup.gravity = vec2(world.gravity_x, world.gravity_y)
+    setup.gravity = vec2(parameters.gravity_x, parameters.gravity_y)
 
     def several(count, n, dtype, buffers):
         big = wp.zeros((count, n), dtype=dtype)

@@ -81,7 +81,7 @@ def solid(
         state,
     )
     if time_step is not None:
-        simulation.world = simulation.world._replace(dt=time_step)
+        simulation.parameters = simulation.parameters._replace(dt=time_step)
     return simulation
 
 

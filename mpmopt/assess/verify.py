@@ -28,7 +28,7 @@ from mpmopt.kernels import Parts, parts
 from mpmopt.scene import Scene, Wall
 from mpmopt.scene.particles import discretise
 from mpmopt.simulation.simulation import Simulation
-from mpmopt.simulation.surroundings import world_of
+from mpmopt.simulation.surroundings import parameters_of
 from mpmopt.validation import count
 
 COMPLEX_STEP = 1e-30
@@ -165,7 +165,7 @@ def kernel_mismatches(scene: Scene, seed: int = 0) -> dict[str, float]:
     return result
 
 
-# Names of what the stress depends on, and of the fields of `kernels.Body`.
+# Names of what the stress depends on, and of the fields of `kernels.ParticleData`.
 CONSTANTS = {"mass": "mass", "la": "lame_lambda", "mu": "lame_mu"}
 
 
@@ -185,7 +185,7 @@ class _Bench:
         v[:] = 0.1 * speed * rng.standard_normal(v.shape)
         C[:] = 0.1 / scene.time_step * rng.uniform(-1.0, 1.0, C.shape)
         F[:] = 0.2 * rng.uniform(-1.0, 1.0, F.shape) + np.eye(2)[:, :, None]
-        self.world = world_of(scene)
+        self.parameters = parameters_of(scene)
         vary = rng.uniform(0.1, 1.0, count)
         sample = Simulation(
             scene,
@@ -196,19 +196,21 @@ class _Bench:
             np.full((scene.steps, len(scene.actuators)), 0.7),
             self.state,
         )
-        self.body = sample.body
-        groups = len(self.body.mass)
+        self.data = sample.data
+        groups = len(self.data.mass)
         self.all = (0, groups)
-        *window, inside = kernels.find_window(kernels.grouped(self.state), self.world, *self.all)
+        *window, inside = kernels.find_window(
+            kernels.grouped(self.state), self.parameters, *self.all
+        )
         if not inside:
             raise DesignError("a particle is outside the grid")
         self.window = tuple(window)
         self.nodes, self.fields = window[2] * window[3], sample.fields
-        affine = rng.standard_normal((4, count)) * np.mean(sample.body.mass) * speed
+        affine = rng.standard_normal((4, count)) * np.mean(sample.data.mass) * speed
         self.inputs: Arrays = {
             **own._asdict(),
             **{
-                short: kernels.ungrouped(getattr(self.body, name), 1, count)
+                short: kernels.ungrouped(getattr(self.data, name), 1, count)
                 for short, name in CONSTANTS.items()
             },
             "signal": np.full(len(scene.actuators), 0.7),
@@ -222,7 +224,7 @@ class _Bench:
     def _tile(self, records: NDArray) -> kernels.Tile:
         """Of all groups, located."""
         tile = kernels.make_tile(self.all[1], records)
-        kernels.locate(records, self.world, self.window, tile, *self.all)
+        kernels.locate(records, self.parameters, self.window, tile, *self.all)
         return tile
 
     def _scratch(self, dtype: type) -> kernels.Scratch:
@@ -258,8 +260,8 @@ class _Bench:
     def _state(self, v: Arrays, dtype: type) -> NDArray:
         return kernels.grouped(self.moved(v, dtype))
 
-    def _body(self, v: Arrays, dtype: type) -> kernels.Body:
-        body = self.body._replace(
+    def _data(self, v: Arrays, dtype: type) -> kernels.ParticleData:
+        data = self.data._replace(
             **{
                 name: kernels.grouped(v[short], repeat=False)
                 for short, name in CONSTANTS.items()
@@ -267,18 +269,18 @@ class _Bench:
             }
         )
         floats = ("volume", *CONSTANTS.values())
-        return body._replace(**{name: getattr(body, name).astype(dtype) for name in floats})
+        return data._replace(**{name: getattr(data, name).astype(dtype) for name in floats})
 
     def deform(self, v: Arrays) -> Arrays:
         old = self._state(v, np.result_type(*v.values()).type)
         new, log_J = old.copy(), np.zeros((self.all[1], 4), old.dtype)
-        kernels.deform(old, new, self.world, log_J, *self.all)
+        kernels.deform(old, new, self.parameters, log_J, *self.all)
         return {"new": self._parts(new).deformation}
 
     def deform_adjoint(self, v: Arrays, w: Arrays) -> Arrays:
         old = self._state(v, float)
         bar = self._bar(deformation=w["new"])
-        kernels.deform_adjoint(old, self.world, bar, *self.all)
+        kernels.deform_adjoint(old, self.parameters, bar, *self.all)
         found = self._parts(bar)
         return {"affine_velocity": found.affine_velocity, "deformation": found.deformation}
 
@@ -289,30 +291,30 @@ class _Bench:
             getattr(parts(bar), name)[:] = value
         return kernels.grouped(bar, repeat=False)
 
-    def _body_bar(self) -> kernels.BodyBar:
-        return kernels.BodyBar.zeros(self.all[1])
+    def _data_bar(self) -> kernels.ParticleDataBar:
+        return kernels.ParticleDataBar.zeros(self.all[1])
 
     def stress(self, v: Arrays) -> Arrays:
         # Here the deformation gradient is the new one, on which the stress depends.
         dtype = np.result_type(*v.values()).type
-        state, body = self._state(v, dtype), self._body(v, dtype)
+        state, data = self._state(v, dtype), self._data(v, dtype)
         tile, log_J = self._tile(state), _log_jacobian(state)
-        kernels.stress(state, state, log_J, body, self.world, v["signal"], tile, *self.all)
-        return {"affine": self._particles(tile.affine, 4) / self.world.dx}
+        kernels.stress(state, state, log_J, data, self.parameters, v["signal"], tile, *self.all)
+        return {"affine": self._particles(tile.affine, 4) / self.parameters.dx}
 
     def stress_adjoint(self, v: Arrays, w: Arrays) -> Arrays:
-        state, body = self._state(v, float), self._body(v, float)
+        state, data = self._state(v, float), self._data(v, float)
         tile, log_J = self._tile(state), _log_jacobian(state)
-        bar, body_bar = np.zeros_like(state), self._body_bar()
+        bar, data_bar = np.zeros_like(state), self._data_bar()
         signal_bar = 0.0 * v["signal"]
         self._gather(tile, w["affine"])
-        given = (state, state, log_J, body, self.world, v["signal"], tile)
-        kernels.stress_adjoint(*given, bar, body_bar, signal_bar, *self.all)
+        given = (state, state, log_J, data, self.parameters, v["signal"], tile)
+        kernels.stress_adjoint(*given, bar, data_bar, signal_bar, *self.all)
         found = self._parts(bar)
         return {
             "affine_velocity": found.affine_velocity,
             "deformation": found.deformation,
-            **{short: self._particles(getattr(body_bar, n), 1) for short, n in CONSTANTS.items()},
+            **{short: self._particles(getattr(data_bar, n), 1) for short, n in CONSTANTS.items()},
             "signal": signal_bar,
         }
 
@@ -323,47 +325,47 @@ class _Bench:
 
     def inertia(self, v: Arrays) -> Arrays:
         dtype = np.result_type(*v.values()).type
-        state, body = self._state(v, dtype), self._body(v, dtype)
+        state, data = self._state(v, dtype), self._data(v, dtype)
         tile = self._tile(state)
-        kernels.inertia(state, body, self.world, tile, *self.all)
-        return {"affine": self._particles(tile.affine, 4) / self.world.dx}
+        kernels.inertia(state, data, self.parameters, tile, *self.all)
+        return {"affine": self._particles(tile.affine, 4) / self.parameters.dx}
 
     def inertia_adjoint(self, v: Arrays, w: Arrays) -> Arrays:
-        state, body = self._state(v, float), self._body(v, float)
-        tile, bar, body_bar = self._tile(state), np.zeros_like(state), self._body_bar()
+        state, data = self._state(v, float), self._data(v, float)
+        tile, bar, data_bar = self._tile(state), np.zeros_like(state), self._data_bar()
         self._gather(tile, w["affine"])
-        kernels.inertia_adjoint(state, body, tile, bar, body_bar, *self.all)
+        kernels.inertia_adjoint(state, data, tile, bar, data_bar, *self.all)
         affine_bar = self._parts(bar).affine_velocity
-        return {"affine_velocity": affine_bar, "mass": self._particles(body_bar.mass, 1)}
+        return {"affine_velocity": affine_bar, "mass": self._particles(data_bar.mass, 1)}
 
     def p2g(self, v: Arrays) -> Arrays:
         dtype = np.result_type(*v.values()).type
-        state, body = self._state(v, dtype), self._body(v, dtype)
+        state, data = self._state(v, dtype), self._data(v, dtype)
         tile, cells = self._tile(state), np.zeros((9 * self.nodes, 4), dtype)
-        tile.affine[:] = kernels.grouped(v["affine"] * self.world.dx, repeat=False)
-        kernels.p2g(state, body, tile, cells, *self.all)
+        tile.affine[:] = kernels.grouped(v["affine"] * self.parameters.dx, repeat=False)
+        kernels.p2g(state, data, tile, cells, *self.all)
         return {"grid": self._nodes(cells)[:, :3]}
 
     def p2g_adjoint(self, v: Arrays, w: Arrays) -> Arrays:
-        state, body = self._state(v, float), self._body(v, float)
-        tile, bar, body_bar = self._tile(state), np.zeros_like(state), self._body_bar()
-        tile.affine[:] = kernels.grouped(v["affine"] * self.world.dx, repeat=False)
+        state, data = self._state(v, float), self._data(v, float)
+        tile, bar, data_bar = self._tile(state), np.zeros_like(state), self._data_bar()
+        tile.affine[:] = kernels.grouped(v["affine"] * self.parameters.dx, repeat=False)
         nodes = np.zeros((self.nodes, kernels.NODE_SIZE))
         nodes[:, :3] = w["grid"]
         cells = self._cells(nodes)
-        kernels.p2g_adjoint(state, body, self.world, tile, cells, bar, body_bar, *self.all)
+        kernels.p2g_adjoint(state, data, self.parameters, tile, cells, bar, data_bar, *self.all)
         found = self._parts(bar)
         return {
             "position": found.position,
             "velocity": found.velocity,
             "affine": self._particles(tile.gathered, 9)[:4],
-            "mass": self._particles(body_bar.mass, 1),
+            "mass": self._particles(data_bar.mass, 1),
         }
 
     def mirror(self, v: Arrays) -> Arrays:
         records = np.zeros((self.nodes, kernels.NODE_SIZE), v["grid"].dtype)
         records[:, :3] = v["grid"]
-        kernels.mirror(records, self.window, self.world)
+        kernels.mirror(records, self.window, self.parameters)
         return {"grid": records[:, :3]}
 
     def _grid(self, v: Arrays, dtype: type) -> NDArray:
@@ -375,14 +377,14 @@ class _Bench:
         dtype = np.result_type(*v.values()).type
         scratch, grid = self._scratch(dtype), self._grid(v, dtype)
         for column in range(self.window[2]):
-            kernels.grid_update(grid, self.window, self.world, scratch.velocity, column)
+            kernels.grid_update(grid, self.window, self.parameters, scratch.velocity, column)
         return {"velocity": scratch.velocity}
 
     def grid_update_adjoint(self, v: Arrays, w: Arrays) -> Arrays:
         scratch, grid = self._scratch(float), self._grid(v, float)
         for column in range(self.window[2]):
             kernels.grid_update_adjoint(
-                grid, self.window, self.world, w["velocity"], scratch.node_bar, column
+                grid, self.window, self.parameters, w["velocity"], scratch.node_bar, column
             )
         return {"grid": scratch.node_bar[:, self.mass_grid > 0.0, :3]}
 
@@ -390,9 +392,9 @@ class _Bench:
         """With the blend, if the scene has one."""
         old, cells = self._before_g2p(v)
         new, tile = np.zeros_like(old), self._tile(old)
-        kernels.g2p(old, new, self.world, tile, cells[0], *self.all)
+        kernels.g2p(old, new, self.parameters, tile, cells[0], *self.all)
         if self.fields == 2:
-            kernels.blend(old, new, self.world, tile, cells[1], *self.all)
+            kernels.blend(old, new, self.parameters, tile, cells[1], *self.all)
         x, v_new, C, _ = self._parts(new)
         return {"position": x, "velocity": v_new, "affine_velocity": C}
 
@@ -405,9 +407,9 @@ class _Bench:
         old, cells = self._before_g2p(v)
         bar, tile = self._bar(**w), self._tile(old)
         cells_bar = [np.zeros_like(each) for each in cells]
-        kernels.g2p_adjoint(self.world, tile, cells[0], cells_bar[0], bar, *self.all)
+        kernels.g2p_adjoint(self.parameters, tile, cells[0], cells_bar[0], bar, *self.all)
         if self.fields == 2:
-            kernels.blend_adjoint(self.world, tile, cells[1], cells_bar[1], bar, *self.all)
+            kernels.blend_adjoint(self.parameters, tile, cells[1], cells_bar[1], bar, *self.all)
         found = self._parts(bar)
         node_velocity = np.stack([self._nodes(each) for each in cells_bar])
         result = {

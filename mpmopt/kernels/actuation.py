@@ -5,14 +5,14 @@ from mpmopt.kernels.simd import load
 
 
 @jit
-def second_piola(body, g, signal):
+def second_piola(data, g, signal):
     """s S of the actuators of four particles: xx, xy, yy."""
-    s00 = s01 = s11 = 0.0 * load(body.mass, g)
+    s00 = s01 = s11 = 0.0 * load(data.mass, g)
     for k in range(signal.size):
-        there = load(body.actuated[k], g)
-        s00 = s00 + signal[k] * body.actuation_stress[k, 0] * there
-        s01 = s01 + signal[k] * body.actuation_stress[k, 1] * there
-        s11 = s11 + signal[k] * body.actuation_stress[k, 2] * there
+        there = load(data.actuated[k], g)
+        s00 = s00 + signal[k] * data.actuation_stress[k, 0] * there
+        s01 = s01 + signal[k] * data.actuation_stress[k, 1] * there
+        s11 = s11 + signal[k] * data.actuation_stress[k, 2] * there
     return s00, s01, s11
 
 

@@ -35,7 +35,7 @@ def parts(state: NDArray) -> Parts:
     return Parts(x, v, C.reshape(tensors), F.reshape(tensors))
 
 
-class World(NamedTuple):
+class Parameters(NamedTuple):
     """What surrounds the body: time step, cell width, nodes per side, gravity and walls."""
 
     dt: float
@@ -52,7 +52,7 @@ class World(NamedTuple):
     mass_tolerance: float  # mass of a node that is rounding of larger ones: the node is empty
 
 
-class Body(NamedTuple):
+class ParticleData(NamedTuple):
     """Constants of G groups of four particles and of K actuators; complex for the complex step."""
 
     volume: NDArray  # (G, 4) reference volume
@@ -65,15 +65,15 @@ class Body(NamedTuple):
     first: NDArray[np.int64]  # (B + 1,) first group of each of B blocks, and G
 
 
-class BodyBar(NamedTuple):
-    """Adjoints of `Body`, accumulated over the steps."""
+class ParticleDataBar(NamedTuple):
+    """Adjoints of `ParticleData`, accumulated over the steps."""
 
     mass: NDArray  # (G, 4)
     lame_lambda: NDArray  # (G, 4)
     lame_mu: NDArray  # (G, 4)
 
     @classmethod
-    def zeros(cls, groups: int, dtype: DTypeLike = float) -> "BodyBar":
+    def zeros(cls, groups: int, dtype: DTypeLike = float) -> "ParticleDataBar":
         """Nothing accumulated yet."""
         return cls(*(np.zeros((groups, 4), dtype) for _ in cls._fields))
 

@@ -45,9 +45,9 @@ def friction(un, ut, walls, k):
 
 
 @jit
-def wall(i, j, u, v, world):
+def wall(i, j, u, v, parameters):
     """Velocity of node (i, j) after the walls, one after the other."""
-    walls = world.walls
+    walls = parameters.walls
     for k in range(len(walls)):
         if is_behind(i, j, walls, k):
             if walls[k, AXIS] == 0:
@@ -58,10 +58,10 @@ def wall(i, j, u, v, world):
 
 
 @jit
-def wall_adjoint(i, j, u, v, world, u_bar, v_bar):
+def wall_adjoint(i, j, u, v, parameters, u_bar, v_bar):
     """Transpose of `wall`: through the derivative D of its responses, of (u, v) by (u, v)."""
     d00, d01, d10, d11 = 1.0, 0.0, 0.0, 1.0
-    walls = world.walls
+    walls = parameters.walls
     for k in range(len(walls)):
         if is_behind(i, j, walls, k):
             if walls[k, AXIS] == 0:

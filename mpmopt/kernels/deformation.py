@@ -6,9 +6,9 @@ from mpmopt.kernels.simd import logarithm, positive, store, store_tensor, tensor
 
 
 @jit
-def deform(old, new, world, log_J, first, last):
+def deform(old, new, parameters, log_J, first, last):
     """F' into the new state and ln J'; returns whether no particle is inverted."""
-    dt = world.dt
+    dt = parameters.dt
     upright = True
     for g in range(first, last):
         c00, c01, c10, c11 = tensor(old, at(g, AFFINE))
@@ -25,9 +25,9 @@ def deform(old, new, world, log_J, first, last):
 
 
 @jit
-def deform_adjoint(old, world, bar, first, last):
+def deform_adjoint(old, parameters, bar, first, last):
     """From F_bar' to F_bar, in place; adds to C_bar."""
-    dt = world.dt
+    dt = parameters.dt
     for g in range(first, last):
         c00, c01, c10, c11 = tensor(old, at(g, AFFINE))
         f00, f01, f10, f11 = tensor(old, at(g, DEFORMATION))

@@ -13,20 +13,20 @@ from mpmopt.kernels.material import energy_density
 
 
 @loop_jit
-def energy(state: NDArray, body: Any, world: Any) -> tuple[float, float]:
+def energy(state: NDArray, data: Any, parameters: Any) -> tuple[float, float]:
     """Kinetic and potential energy of a state, of records of groups of four particles.
 
     F is half a step behind the velocities, as `deform` uses the old ones, and x half a step ahead
     of them; both are taken where the velocities are. Infinite if a particle is inverted.
     """
     kinetic = potential = 0.0
-    half, inertia = 0.5 * world.dt, 0.25 * world.dx * world.dx
-    for g in range(body.mass.shape[0]):
+    half, inertia = 0.5 * parameters.dt, 0.25 * parameters.dx * parameters.dx
+    for g in range(data.mass.shape[0]):
         for k in range(4):
-            mass, volume = float(body.mass[g, k].real), float(body.volume[g, k].real)
+            mass, volume = float(data.mass[g, k].real), float(data.volume[g, k].real)
             if mass == 0.0:  # only fills its group
                 continue
-            mu, lam = float(body.lame_mu[g, k].real), float(body.lame_lambda[g, k].real)
+            mu, lam = float(data.lame_mu[g, k].real), float(data.lame_lambda[g, k].real)
             x, y = float(state[at(g, POSITION), k].real), float(state[at(g, POSITION + 1), k].real)
             u, v = float(state[at(g, VELOCITY), k].real), float(state[at(g, VELOCITY + 1), k].real)
             c00, c01, c10, c11 = components(state, g, AFFINE, k)
@@ -37,27 +37,27 @@ def energy(state: NDArray, body: Any, world: Any) -> tuple[float, float]:
             turning = c00 * c00 + c01 * c01 + c10 * c10 + c11 * c11
             kinetic += 0.5 * mass * (u * u + v * v + inertia * turning)
             potential += volume * energy_density(F, math.log(J), lam, mu)
-            potential -= mass * world.gravity_x * (x - half * u)
-            potential -= mass * world.gravity_y * (y - half * v)
+            potential -= mass * parameters.gravity_x * (x - half * u)
+            potential -= mass * parameters.gravity_y * (y - half * v)
     return kinetic, potential
 
 
 @loop_jit
-def grips(states: NDArray, slots: NDArray, body: Any, world: Any, out: NDArray) -> None:
+def grips(states: NDArray, slots: NDArray, data: Any, parameters: Any, out: NDArray) -> None:
     """What each actuator squeezes: sum V/2 S : F^T F, of some slots' states into `out` (n, K).
 
     Its rate times the signal s is the power that the stress s F S F^T takes from the body.
     """
-    half = 0.5 * world.dt
+    half = 0.5 * parameters.dt
     for n in range(slots.size):
         state = states[slots[n]]
         for a in range(out.shape[1]):
-            s00, s01 = body.actuation_stress[a, 0], body.actuation_stress[a, 1]
-            s11, held = body.actuation_stress[a, 2], 0.0
-            for g in range(body.mass.shape[0]):
-                if body.active[g]:
+            s00, s01 = data.actuation_stress[a, 0], data.actuation_stress[a, 1]
+            s11, held = data.actuation_stress[a, 2], 0.0
+            for g in range(data.mass.shape[0]):
+                if data.active[g]:
                     for k in range(4):
                         stretch = squeezed(midway(state, g, k, half), s00, s01, s11)
-                        volume = float(body.volume[g, k].real)
-                        held += 0.5 * volume * body.actuated[a, g, k] * stretch
+                        volume = float(data.volume[g, k].real)
+                        held += 0.5 * volume * data.actuated[a, g, k] * stretch
             out[n, a] = held

@@ -6,19 +6,19 @@ from mpmopt.kernels.simd import add, fused, load, nothing, store
 
 
 @jit
-def mirror(records, window, world):
+def mirror(records, window, parameters):
     """Add to each node what the mirrored half puts there; this map is its own transpose.
 
     Records of nodes are (q_x, q_y, m, 0). With R the reflection, a node and its image across the
     plane become r + R r_image and R r + r_image.
     """
-    if world.mirror_axis < 0:
+    if parameters.mirror_axis < 0:
         return
     i0, j0, ni, nj = window
-    normal = world.mirror_axis
+    normal = parameters.mirror_axis
     first, count, stride = (i0, ni, nj) if normal == 0 else (j0, nj, 1)
     across, step = (nj, 1) if normal == 0 else (ni, nj)
-    plane = world.mirror_node - first
+    plane = parameters.mirror_node - first
     for line in range(across):
         for k in range(count - plane):
             node = line * step + (plane + k) * stride
@@ -45,54 +45,54 @@ def add_blocks(parts, field, windows, window, a, nodes):
 
 
 @jit
-def free_velocity(grid, node, per_m, world):
+def free_velocity(grid, node, per_m, parameters):
     """Velocity of a node from momentum, 1 / mass and gravity, before the walls."""
     return (
-        fused(grid[0, node, 0], per_m, world.dt * world.gravity_x),
-        fused(grid[0, node, 1], per_m, world.dt * world.gravity_y),
+        fused(grid[0, node, 0], per_m, parameters.dt * parameters.gravity_x),
+        fused(grid[0, node, 1], per_m, parameters.dt * parameters.gravity_y),
     )
 
 
 @jit
-def grid_update(grid, window, world, velocity, a):
+def grid_update(grid, window, parameters, velocity, a):
     """Velocity of column a's nodes from momentum, gravity and walls; zero where no mass is."""
     i0, j0, _, nj = window
     for b in range(nj):
         node = a * nj + b
         m = grid[0, node, 2]
         u = v = 0.0 * m
-        if m.real > world.mass_tolerance:
-            u, v = free_velocity(grid, node, 1.0 / m, world)
-            u, v = wall(i0 + a, j0 + b, u, v, world)
+        if m.real > parameters.mass_tolerance:
+            u, v = free_velocity(grid, node, 1.0 / m, parameters)
+            u, v = wall(i0 + a, j0 + b, u, v, parameters)
         velocity[0, 2 * node], velocity[0, 2 * node + 1] = u, v
-        if world.keep > 0.0:
+        if parameters.keep > 0.0:
             u = v = 0.0 * m
-            if m.real > world.mass_tolerance:
+            if m.real > parameters.mass_tolerance:
                 per_m = 1.0 / grid[1, node, 2]
                 u, v = grid[1, node, 0] * per_m, grid[1, node, 1] * per_m
             velocity[1, 2 * node], velocity[1, 2 * node + 1] = u, v
 
 
 @jit
-def grid_update_adjoint(grid, window, world, velocity_bar, node_bar, a):
+def grid_update_adjoint(grid, window, parameters, velocity_bar, node_bar, a):
     """From velocity_bar of column a's nodes to their momentum_bar and mass_bar."""
     i0, j0, _, nj = window
     for b in range(nj):
         node = a * nj + b
         m = grid[0, node, 2]
-        if m > world.mass_tolerance:
+        if m > parameters.mass_tolerance:
             per_m = 1.0 / m
             u, v = grid[0, node, 0] * per_m, grid[0, node, 1] * per_m
             u_bar, v_bar = wall_adjoint(
                 i0 + a,
                 j0 + b,
-                *free_velocity(grid, node, per_m, world),
-                world,
+                *free_velocity(grid, node, per_m, parameters),
+                parameters,
                 velocity_bar[0, 2 * node],
                 velocity_bar[0, 2 * node + 1],
             )
             momentum_bar(node_bar[0], node, u, v, per_m, u_bar, v_bar)
-            if world.keep > 0.0:
+            if parameters.keep > 0.0:
                 per_m = 1.0 / grid[1, node, 2]
                 u, v = grid[1, node, 0] * per_m, grid[1, node, 1] * per_m
                 u_bar, v_bar = velocity_bar[1, 2 * node], velocity_bar[1, 2 * node + 1]

@@ -9,7 +9,7 @@ from mpmopt.kernels.material import wave_modulus
 
 
 @jit
-def indicators(state, body, world, solid, first, last):
+def indicators(state, data, parameters, solid, first, last):
     """How close groups of particles come to where a step is too long, as in `Indicators`.
 
     The largest (dt / dx) sqrt(M / rho) and dt |C|, the smallest J, and the largest stretch of
@@ -20,9 +20,9 @@ def indicators(state, body, world, solid, first, last):
     smallest = math.inf
     for g in range(first, last):
         for k in range(4):
-            mass, volume = body.mass[g, k].real, body.volume[g, k].real
+            mass, volume = data.mass[g, k].real, data.volume[g, k].real
             if mass > 0.0:  # else it only fills its group
-                mu, lam = body.lame_mu[g, k].real, body.lame_lambda[g, k].real
+                mu, lam = data.lame_mu[g, k].real, data.lame_lambda[g, k].real
                 c00, c01, c10, c11 = components(state, g, AFFINE, k)
                 F = components(state, g, DEFORMATION, k)
                 trace, apart = stretches(F)
@@ -32,6 +32,6 @@ def indicators(state, body, world, solid, first, last):
                 stiffest = max(stiffest, stiffness * volume / mass)
                 fastest = max(fastest, c00 * c00 + c01 * c01 + c10 * c10 + c11 * c11)
                 smallest = min(smallest, F[0] * F[3] - F[1] * F[2])
-    courant = world.dt / world.dx * math.sqrt(stiffest)
-    velocity_increment = world.dt * math.sqrt(fastest)
+    courant = parameters.dt / parameters.dx * math.sqrt(stiffest)
+    velocity_increment = parameters.dt * math.sqrt(fastest)
     return courant, velocity_increment, smallest, math.sqrt(longest)

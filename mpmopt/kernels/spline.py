@@ -204,11 +204,11 @@ def interpolation(position, dx, rows):
 
 
 @jit
-def find_window(state, world, first, last):
+def find_window(state, parameters, first, last):
     """Window (i0, j0, ni, nj) of the nodes that particles touch; whether all are on the grid."""
-    per_dx, end_x, end_y = world.per_dx, world.nodes_x - 2.0, world.nodes_y - 2.0
+    per_dx, end_x, end_y = parameters.per_dx, parameters.nodes_x - 2.0, parameters.nodes_y - 2.0
     i_max = j_max = real(nothing(state))
-    i_min, j_min = i_max + world.nodes_x, j_max + world.nodes_y
+    i_min, j_min = i_max + parameters.nodes_x, j_max + parameters.nodes_y
     for g in range(first, last):
         x = cell_coordinate(real(load(state, at(g, POSITION))), per_dx)
         y = cell_coordinate(real(load(state, at(g, POSITION + 1))), per_dx)
@@ -224,10 +224,10 @@ def find_window(state, world, first, last):
 
 
 @jit
-def locate(state, world, part, tile, first, last):
+def locate(state, parameters, part, tile, first, last):
     """The cells of the particles in the window `part` and their places in them, into the tile."""
     i0, j0, _, nj = part
-    per_dx = world.per_dx
+    per_dx = parameters.per_dx
     for g in range(first, last):
         k = g - first
         x, y = load(state, at(g, POSITION)), load(state, at(g, POSITION + 1))
@@ -241,25 +241,25 @@ def locate(state, world, part, tile, first, last):
 
 
 @jit
-def whole_window(windows, world):
+def whole_window(windows, parameters):
     """Window (i0, j0, ni, nj) that holds those of all blocks (B, 4), and their mirror images."""
-    i0, j0, i1, j1 = world.nodes_x, world.nodes_y, 0, 0
+    i0, j0, i1, j1 = parameters.nodes_x, parameters.nodes_y, 0, 0
     for b in range(windows.shape[0]):
         i0 = min(i0, windows[b, 0])
         j0 = min(j0, windows[b, 1])
         i1 = max(i1, windows[b, 0] + windows[b, 2])
         j1 = max(j1, windows[b, 1] + windows[b, 3])
-    if world.mirror_axis == 0:
-        i0 = min(i0, 2 * world.mirror_node - (i1 - 1))
-    elif world.mirror_axis == 1:
-        j0 = min(j0, 2 * world.mirror_node - (j1 - 1))
+    if parameters.mirror_axis == 0:
+        i0 = min(i0, 2 * parameters.mirror_node - (i1 - 1))
+    elif parameters.mirror_axis == 1:
+        j0 = min(j0, 2 * parameters.mirror_node - (j1 - 1))
     return i0, j0, i1 - i0, j1 - j0
 
 
 @jit
-def first_outside(state, world, first, last):
+def first_outside(state, parameters, first, last):
     """The first particle of groups of four that is off the grid, or is not a number."""
-    per_dx, end_x, end_y = world.per_dx, world.nodes_x - 2.0, world.nodes_y - 2.0
+    per_dx, end_x, end_y = parameters.per_dx, parameters.nodes_x - 2.0, parameters.nodes_y - 2.0
     for p in range(4 * first, 4 * last):
         x = cell_coordinate(state[at(p // 4, POSITION), p % 4].real, per_dx)
         y = cell_coordinate(state[at(p // 4, POSITION + 1), p % 4].real, per_dx)

@@ -23,8 +23,8 @@ DONE, WINDOW_TOO_SMALL, PART_TOO_SMALL, ESCAPED, INVERTED, ABANDONED = range(6)
 
 
 @loop_jit
-def advance(states, grids, windows, logs, first, last, body, world, signal, scratch, barrier_state,
-            thread, threads):  # fmt: skip
+def advance(states, grids, windows, logs, first, last, data, parameters, signal, scratch,
+            barrier_state, thread, threads):  # fmt: skip
     """Advance from the start of step `first` to the start of step `last`.
 
     Step n leads from slot n to slot n + 1 of `states` and leaves its nodes in slot n of `grids`,
@@ -39,7 +39,7 @@ def advance(states, grids, windows, logs, first, last, body, world, signal, scra
     takes its blocks of particles and its columns of nodes; what blocks put on nodes is added in
     their order, so that results do not depend on the number of threads.
     """
-    blocks = body.first.size - 1
+    blocks = data.first.size - 1
     own = range(thread * blocks // threads, (thread + 1) * blocks // threads)
     parts, ends = scratch.parts, scratch.ends
     tile = make_tile(TILE, states)
@@ -51,11 +51,11 @@ def advance(states, grids, windows, logs, first, last, body, world, signal, scra
         slot = n % grids.shape[0]
         grid, log_J = grids[slot], logs[slot]
         for k in own:
-            p0, p1 = body.first[k], body.first[k + 1]
-            i0, j0, ni, nj, inside = find_window(old, world, p0, p1)
+            p0, p1 = data.first[k], data.first[k + 1]
+            i0, j0, ni, nj, inside = find_window(old, parameters, p0, p1)
             ends[k, 0], ends[k, 1] = DONE, -1
             if not inside:
-                ends[k, 0], ends[k, 1] = ESCAPED, first_outside(old, world, p0, p1)
+                ends[k, 0], ends[k, 1] = ESCAPED, first_outside(old, parameters, p0, p1)
             elif n < last:
                 windows[slot, k, 0], windows[slot, k, 1] = i0, j0
                 windows[slot, k, 2], windows[slot, k, 3] = ni, nj
@@ -67,16 +67,16 @@ def advance(states, grids, windows, logs, first, last, body, world, signal, scra
                         clear(node_cells[field], part)
                     for g0 in range(p0, p1, TILE):
                         g1 = min(g0 + TILE, p1)
-                        if not deform(old, new, world, log_J, g0, g1):
+                        if not deform(old, new, parameters, log_J, g0, g1):
                             ends[k, 0], ends[k, 1] = INVERTED, first_inverted(new, g0, g1)
                             break
-                        locate(old, world, part, tile, g0, g1)
+                        locate(old, parameters, part, tile, g0, g1)
                         for field in range(fields):
                             if field == 0:
-                                stress(old, new, log_J, body, world, signal[n], tile, g0, g1)
+                                stress(old, new, log_J, data, parameters, signal[n], tile, g0, g1)
                             else:
-                                inertia(old, body, world, tile, g0, g1)
-                            p2g(old, body, tile, node_cells[field], g0, g1)
+                                inertia(old, data, parameters, tile, g0, g1)
+                            p2g(old, data, tile, node_cells[field], g0, g1)
                     for field in range(fields):
                         taylor_adjoint(node_cells[field], part, parts[k, field])
         if not meet(barrier_state, threads):
@@ -86,7 +86,7 @@ def advance(states, grids, windows, logs, first, last, body, world, signal, scra
                 return n, ends[k, 0], ends[k, 1]
         if n == last:
             break
-        i0, j0, ni, nj = whole_window(windows[slot, :blocks], world)
+        i0, j0, ni, nj = whole_window(windows[slot, :blocks], parameters)
         window = (i0, j0, ni, nj)
         if thread == 0:
             for k in range(4):
@@ -97,16 +97,16 @@ def advance(states, grids, windows, logs, first, last, body, world, signal, scra
         for field in range(fields):
             for a in columns:
                 add_blocks(parts, field, windows[slot], window, a, grid[field])
-        if world.mirror_axis >= 0:
+        if parameters.mirror_axis >= 0:
             if not meet(barrier_state, threads):
                 return n, ABANDONED, -1
             if thread == 0:
                 for field in range(fields):
-                    mirror(grid[field], window, world)
+                    mirror(grid[field], window, parameters)
             if not meet(barrier_state, threads):
                 return n, ABANDONED, -1
         for a in columns:
-            grid_update(grid, window, world, scratch.velocity, a)
+            grid_update(grid, window, parameters, scratch.velocity, a)
         if not meet(barrier_state, threads):
             return n, ABANDONED, -1
         for k in own:
@@ -114,25 +114,25 @@ def advance(states, grids, windows, logs, first, last, body, world, signal, scra
             part = (w[0], w[1], w[2], w[3])
             for field in range(fields):
                 taylor(scratch.velocity[field], window, part, velocity_cells[field])
-            for g0 in range(body.first[k], body.first[k + 1], TILE):
-                g1 = min(g0 + TILE, body.first[k + 1])
-                locate(old, world, part, tile, g0, g1)
-                g2p(old, new, world, tile, velocity_cells[0], g0, g1)
+            for g0 in range(data.first[k], data.first[k + 1], TILE):
+                g1 = min(g0 + TILE, data.first[k + 1])
+                locate(old, parameters, part, tile, g0, g1)
+                g2p(old, new, parameters, tile, velocity_cells[0], g0, g1)
                 if fields == 2:
-                    blend(old, new, world, tile, velocity_cells[1], g0, g1)
+                    blend(old, new, parameters, tile, velocity_cells[1], g0, g1)
     return last, DONE, -1
 
 
 @loop_jit
-def advance_adjoint(states, grids, windows, logs, first, last, body, world, signal, scratch, bar,
-                    body_bar, signal_bar, barrier_state, thread, threads):  # fmt: skip
+def advance_adjoint(states, grids, windows, logs, first, last, data, parameters, signal, scratch,
+                    bar, data_bar, signal_bar, barrier_state, thread, threads):  # fmt: skip
     """Go back from the start of step `last` to the start of step `first`: the adjoint of `advance`.
 
-    `bar` holds the adjoint of the state and is overwritten; `body_bar` and `signal_bar`
+    `bar` holds the adjoint of the state and is overwritten; `data_bar` and `signal_bar`
     (B, steps, K), by blocks, are added to. All that `advance` leaves of the steps must have been
     kept.
     """
-    blocks = body.first.size - 1
+    blocks = data.first.size - 1
     own = range(thread * blocks // threads, (thread + 1) * blocks // threads)
     parts_bar, velocity, velocity_bar = scratch.parts_bar, scratch.velocity, scratch.velocity_bar
     tile = make_tile(TILE, states)
@@ -145,11 +145,11 @@ def advance_adjoint(states, grids, windows, logs, first, last, body, world, sign
         ni, window = w[2], (w[0], w[1], w[2], w[3])
         columns = range(thread * ni // threads, (thread + 1) * ni // threads)
         for a in columns:
-            grid_update(grid, window, world, velocity, a)
+            grid_update(grid, window, parameters, velocity, a)
         if not meet(barrier_state, threads):
             return
         for k in own:
-            p0, p1 = body.first[k], body.first[k + 1]
+            p0, p1 = data.first[k], data.first[k + 1]
             w = windows[n, k]
             part = (w[0], w[1], w[2], w[3])
             for field in range(fields):
@@ -157,13 +157,13 @@ def advance_adjoint(states, grids, windows, logs, first, last, body, world, sign
                 clear(velocity_cells_bar[field], part)
             for g0 in range(p0, p1, TILE):
                 g1 = min(g0 + TILE, p1)
-                locate(old, world, part, tile, g0, g1)
+                locate(old, parameters, part, tile, g0, g1)
                 g2p_adjoint(
-                    world, tile, velocity_cells[0], velocity_cells_bar[0], bar, g0, g1
+                    parameters, tile, velocity_cells[0], velocity_cells_bar[0], bar, g0, g1
                 )  # fmt: skip
                 if fields == 2:
                     blend_adjoint(
-                        world, tile, velocity_cells[1], velocity_cells_bar[1], bar, g0, g1
+                        parameters, tile, velocity_cells[1], velocity_cells_bar[1], bar, g0, g1
                     )  # fmt: skip
             for field in range(fields):
                 taylor_adjoint(velocity_cells_bar[field], part, parts_bar[k, field])
@@ -172,35 +172,37 @@ def advance_adjoint(states, grids, windows, logs, first, last, body, world, sign
         for a in columns:
             for field in range(fields):
                 add_blocks(parts_bar, field, windows[n], window, a, velocity_bar[field])
-            grid_update_adjoint(grid, window, world, velocity_bar, scratch.node_bar, a)
+            grid_update_adjoint(grid, window, parameters, velocity_bar, scratch.node_bar, a)
         if not meet(barrier_state, threads):
             return
-        if world.mirror_axis >= 0:
+        if parameters.mirror_axis >= 0:
             if thread == 0:
                 for field in range(fields):
-                    mirror(scratch.node_bar[field], window, world)
+                    mirror(scratch.node_bar[field], window, parameters)
             if not meet(barrier_state, threads):
                 return
         for k in own:
-            p0, p1 = body.first[k], body.first[k + 1]
+            p0, p1 = data.first[k], data.first[k + 1]
             w = windows[n, k]
             part = (w[0], w[1], w[2], w[3])
             for field in range(fields):
                 taylor(scratch.node_bar[field], window, part, node_cells[field])
             for g0 in range(p0, p1, TILE):
                 g1 = min(g0 + TILE, p1)
-                locate(old, world, part, tile, g0, g1)
+                locate(old, parameters, part, tile, g0, g1)
                 for field in range(fields):
                     if field == 0:
-                        stress(old, new, log_J, body, world, signal[n], tile, g0, g1)
+                        stress(old, new, log_J, data, parameters, signal[n], tile, g0, g1)
                     else:
-                        inertia(old, body, world, tile, g0, g1)
-                    p2g_adjoint(old, body, world, tile, node_cells[field], bar, body_bar, g0, g1)
+                        inertia(old, data, parameters, tile, g0, g1)
+                    p2g_adjoint(
+                        old, data, parameters, tile, node_cells[field], bar, data_bar, g0, g1
+                    )
                     if field == 0:
                         stress_adjoint(
-                            old, new, log_J, body, world, signal[n], tile, bar, body_bar,
+                            old, new, log_J, data, parameters, signal[n], tile, bar, data_bar,
                             signal_bar[k, n], g0, g1,
                         )  # fmt: skip
                     else:
-                        inertia_adjoint(old, body, tile, bar, body_bar, g0, g1)
-                deform_adjoint(old, world, bar, g0, g1)
+                        inertia_adjoint(old, data, tile, bar, data_bar, g0, g1)
+                deform_adjoint(old, parameters, bar, g0, g1)

@@ -31,9 +31,9 @@ from mpmopt.kernels.spline import deposit, moments, slopes
 
 
 @jit
-def momentum(state, body, tile, g, t, k):
+def momentum(state, data, tile, g, t, k):
     """What particle k of a group puts on nodes: (m v_x, m v_y, m, 0), columns of A dx likewise."""
-    m, A, row = number(body.mass, g, k), tile.affine, 4 * t
+    m, A, row = number(data.mass, g, k), tile.affine, 4 * t
     zero = 0.0 * m
     u, v = number(state, at(g, VELOCITY), k), number(state, at(g, VELOCITY + 1), k)
     q = pack(m * u, m * v, m, zero)
@@ -43,23 +43,23 @@ def momentum(state, body, tile, g, t, k):
 
 
 @jit
-def p2g(state, body, tile, cells, first, last):
+def p2g(state, data, tile, cells, first, last):
     """Particle to grid: momentum and mass (q_x, q_y, m, 0), as moments of cells."""
     for g in range(first, last):
         t = g - first
         for k in range(4):
-            q, a0, a1 = momentum(state, body, tile, g, t, k)
+            q, a0, a1 = momentum(state, data, tile, g, t, k)
             deposit(cells, tile, t, k, q, a0, a1)
 
 
 @jit
-def p2g_adjoint(state, body, world, tile, cells, bar, body_bar, first, last):
+def p2g_adjoint(state, data, parameters, tile, cells, bar, data_bar, first, last):
     """From momentum_bar and mass_bar of cells to A_bar; adds to x_bar, v_bar and mass_bar."""
-    dx, per_dx, gathered = world.dx, world.per_dx, tile.gathered
+    dx, per_dx, gathered = parameters.dx, parameters.per_dx, tile.gathered
     for g in range(first, last):
         t = g - first
         for k in range(4):
-            q, a0, a1 = momentum(state, body, tile, g, t, k)
+            q, a0, a1 = momentum(state, data, tile, g, t, k)
             mean, along_x, along_y = moments(cells, tile, t, k)
             slope_x, slope_y = slopes(cells, tile, t, k, q, a0, a1)
             set_number(gathered, in_tile(t, AFFINE_BAR), k, along_x[0])
@@ -75,18 +75,18 @@ def p2g_adjoint(state, body, world, tile, cells, bar, body_bar, first, last):
         store_tensor(gathered, in_tile(t, AFFINE_BAR), dx * a00, dx * a01, dx * a10, dx * a11)
         add(bar, at(g, POSITION), per_dx * load(gathered, in_tile(t, SLOPE)))
         add(bar, at(g, POSITION + 1), per_dx * load(gathered, in_tile(t, SLOPE + 1)))
-        m, u, v = load(body.mass, g), load(state, at(g, VELOCITY)), load(state, at(g, VELOCITY + 1))
+        m, u, v = load(data.mass, g), load(state, at(g, VELOCITY)), load(state, at(g, VELOCITY + 1))
         u_bar = load(gathered, in_tile(t, VELOCITY_BAR))
         v_bar = load(gathered, in_tile(t, VELOCITY_BAR + 1))
         add(bar, at(g, VELOCITY), m * u_bar)
         add(bar, at(g, VELOCITY + 1), m * v_bar)
-        add(body_bar.mass, g, load(gathered, in_tile(t, MASS_BAR)) + u * u_bar + v * v_bar)
+        add(data_bar.mass, g, load(gathered, in_tile(t, MASS_BAR)) + u * u_bar + v * v_bar)
 
 
 @jit
-def g2p(old, new, world, tile, cells, first, last):
+def g2p(old, new, parameters, tile, cells, first, last):
     """Grid to particle: the new velocity, affine velocity and position."""
-    dt, per_dx = world.dt, 4.0 / world.dx
+    dt, per_dx = parameters.dt, 4.0 / parameters.dx
     for g in range(first, last):
         t = g - first
         for k in range(4):
@@ -105,12 +105,12 @@ def g2p(old, new, world, tile, cells, first, last):
 
 
 @jit
-def g2p_adjoint(world, tile, cells, cells_bar, bar, first, last):
+def g2p_adjoint(parameters, tile, cells, cells_bar, bar, first, last):
     """From x_bar', v_bar', C_bar' to velocity_bar, as moments of cells, and to x_bar, v_bar, C_bar.
 
     Without a blend v_bar and C_bar are zero here: what follows adds to them.
     """
-    dt, per_dx = world.dt, world.per_dx
+    dt, per_dx = parameters.dt, parameters.per_dx
     c, h = 4.0 * per_dx, tile.gathered
     for g in range(first, last):
         t = g - first
@@ -118,7 +118,7 @@ def g2p_adjoint(world, tile, cells, cells_bar, bar, first, last):
         for axis in range(2):
             x_bar, v_bar = load(bar, at(g, POSITION + axis)), load(bar, at(g, VELOCITY + axis))
             store(h, in_tile(t, VELOCITY_BAR + axis), v_bar + dt * x_bar)
-            store(bar, at(g, VELOCITY + axis), world.keep * v_bar)
+            store(bar, at(g, VELOCITY + axis), parameters.keep * v_bar)
         c00, c01, c10, c11 = tensor(bar, at(g, AFFINE))
         store_tensor(h, in_tile(t, AFFINE_BAR), c * c00, c * c01, c * c10, c * c11)
         store_tensor(bar, at(g, AFFINE), none, none, none, none)
@@ -133,7 +133,7 @@ def g2p_adjoint(world, tile, cells, cells_bar, bar, first, last):
 
 
 @jit
-def blend(old, new, world, tile, cells, first, last):
+def blend(old, new, parameters, tile, cells, first, last):
     """Particles keep a share of what the transfer of their own velocity smoothed away."""
     for g in range(first, last):
         t = g - first
@@ -144,16 +144,16 @@ def blend(old, new, world, tile, cells, first, last):
         for axis in range(2):
             smoothed = load(tile.gathered, in_tile(t, VELOCITY_BAR + axis))
             lost = load(old, at(g, VELOCITY + axis)) - smoothed
-            add(new, at(g, VELOCITY + axis), world.keep * lost)
+            add(new, at(g, VELOCITY + axis), parameters.keep * lost)
 
 
 @jit
-def blend_adjoint(world, tile, cells, cells_bar, bar, first, last):
+def blend_adjoint(parameters, tile, cells, cells_bar, bar, first, last):
     """To velocity_bar of the second field, as moments of cells; adds to x_bar.
 
     After `g2p_adjoint`, which leaves keep v_bar' as v_bar.
     """
-    per_dx = world.per_dx
+    per_dx = parameters.per_dx
     for g in range(first, last):
         t = g - first
         for k in range(4):

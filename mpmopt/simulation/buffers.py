@@ -50,10 +50,10 @@ class Segment:
         self.simulation, self.memory = simulation, memory
         memory.runs += 1
         self.run = memory.runs
-        groups, dtype = simulation.body.mass.shape[0], simulation.initial.dtype
+        groups, dtype = simulation.data.mass.shape[0], simulation.initial.dtype
         states = (length + 1, kernels.STATE_SIZE * groups, 4)
         self.states = memory.take("states", states, dtype)
-        self.blocks = len(simulation.body.first) - 1
+        self.blocks = len(simulation.data.first) - 1
         self.windows = np.zeros((length, self.blocks + 1, 4), np.int64)
         self.logs = memory.take("logs", (length, groups, 4), dtype)
         self.grids = np.empty((length, simulation.fields, 0, kernels.NODE_SIZE), dtype)
@@ -107,8 +107,8 @@ class Segment:
                 self.logs,
                 reached,
                 stop,
-                simulation.body,
-                simulation.world,
+                simulation.data,
+                simulation.parameters,
                 signal,
                 self.scratch,
             )
@@ -162,7 +162,7 @@ def _failure(
         what = "its position is not a number"
     else:
         width, height = simulation.scene.grid.size
-        margin = simulation.world.dx / 2
+        margin = simulation.parameters.dx / 2
         what = (
             f"it left the grid ({margin:g} to {width - margin:g} by {margin:g} to "
             f"{height - margin:g})"

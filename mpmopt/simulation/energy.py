@@ -24,13 +24,13 @@ class Balance:
 
     Parameters
     ----------
-    body, world
+    data, parameters
         As the kernels see them.
     signal : (steps, K) array
     """
 
-    def __init__(self, body: Any, world: Any, signal: NDArray) -> None:
-        self._body, self._world = body, world
+    def __init__(self, data: Any, parameters: Any, signal: NDArray) -> None:
+        self._data, self._parameters = data, parameters
         self._steps = len(signal)
         size, change = (np.abs(x).max(initial=0.0) for x in (signal, np.diff(signal, axis=0)))
         between = SIGNAL_CHANGE * size / change if change > 0.0 else math.inf
@@ -43,9 +43,11 @@ class Balance:
         self._last: tuple[float, float] | None = None
         self._lowest, self._rise, self._turnover = math.inf, 0.0, 0.0
         # What is rounding only: of strains, and of positions in gravity.
-        modulus = float((body.volume.real * (body.lame_lambda.real + 2 * body.lame_mu.real)).sum())
-        weight = float(body.mass.real.sum()) * math.hypot(world.gravity_x, world.gravity_y)
-        height = world.dx * max(world.nodes_x, world.nodes_y)
+        modulus = float((data.volume.real * (data.lame_lambda.real + 2 * data.lame_mu.real)).sum())
+        weight = float(data.mass.real.sum()) * math.hypot(
+            parameters.gravity_x, parameters.gravity_y
+        )
+        height = parameters.dx * max(parameters.nodes_x, parameters.nodes_y)
         self._rounding = ROUNDING * float(np.finfo(signal.dtype).eps) * (modulus + weight * height)
 
     def follow(self, states: NDArray, first: int, last: int) -> None:
@@ -55,7 +57,7 @@ class Balance:
         if begin <= end:
             places = np.minimum(self._every * np.arange(begin, end + 1), self._steps) - first
             held = np.zeros((len(places), len(self._held)))
-            grips(states, places, self._body, self._world, held)
+            grips(states, places, self._data, self._parameters, held)
             if begin > 0:
                 held = np.concatenate([[self._held], held])
             work = -(self._mean[end - len(held) + 1 : end] * np.diff(held, axis=0)).sum(axis=1)
@@ -69,7 +71,7 @@ class Balance:
             self._look(states[last - first], last)
 
     def _look(self, state: NDArray, step: int) -> None:
-        kinetic, potential = energy(state, self._body, self._world)
+        kinetic, potential = energy(state, self._data, self._parameters)
         work = float(self._work[-(-step // self._every)])
         balance = kinetic + potential - work
         if self._last is None:

@@ -87,7 +87,7 @@ class Watcher:
         self._wanted = {int(step) for step in (*instants, steps)}
         self.states: dict[int, NDArray] = {}
         self.simulation, self._seen = simulation, Indicators()
-        self._balance = Balance(simulation.body, simulation.world, simulation.signal)
+        self._balance = Balance(simulation.data, simulation.parameters, simulation.signal)
 
     def follow(self, states: NDArray, first: int, last: int) -> None:
         """Look at steps `first` to `last`, whose states are in slots 0, 1, ..."""

@@ -29,9 +29,9 @@ def step(simulation: Simulation, state: NDArray, n: int) -> NDArray:
     -------
     (12, N) array
     """
-    scene, body, count = simulation.scene, simulation.body, state.shape[1]
+    scene, data, count = simulation.scene, simulation.data, state.shape[1]
     dt, dx = scene.time_step, scene.grid.dx
-    constants = (body.volume, body.mass, body.lame_lambda, body.lame_mu)
+    constants = (data.volume, data.mass, data.lame_lambda, data.lame_mu)
     V, m, la, mu = (ungrouped(values, 1, count)[0] for values in constants)
     x, v, C, F = parts(state)
     I = np.eye(2)[:, :, None]  # noqa: E741

@@ -19,7 +19,7 @@ from mpmopt.scene.particles import Particles
 from mpmopt.simulation.buffers import Memory, Segment
 from mpmopt.simulation.checkpoints import Checkpointing, Checkpoints, Schedule
 from mpmopt.simulation.indicators import WATCH, Indicators, Watched, Watcher
-from mpmopt.simulation.surroundings import world_of
+from mpmopt.simulation.surroundings import parameters_of
 from mpmopt.simulation.threads import in_parallel
 from mpmopt.validation import shown
 
@@ -129,10 +129,10 @@ class Simulation:
         # A node's mass is a sum that cancels, so the least of it is rounding of a particle's.
         heaviest = float((particles.volume * np.real(density)).max())
         mass_tolerance = 8.0 * np.finfo(real).eps * heaviest
-        self.world = world_of(scene)._replace(mass_tolerance=mass_tolerance)
+        self.parameters = parameters_of(scene)._replace(mass_tolerance=mass_tolerance)
         actuator = kernels.grouped(particles.actuator)
         stress = [(S[0][0], S[0][1], S[1][1]) for S in (a.stress for a in scene.actuators)]
-        self.body = kernels.Body(
+        self.data = kernels.ParticleData(
             volume=kernels.grouped(particles.volume.astype(dtype), repeat=False),
             mass=kernels.grouped((particles.volume * density).astype(dtype), repeat=False),
             lame_lambda=kernels.grouped(np.asarray(lame_lambda, dtype=dtype)),
@@ -214,13 +214,15 @@ class Simulation:
     def indicators(self, records: NDArray) -> Indicators:
         """Those of a state, as records of groups of particles (`grouped`), but for energy."""
         solid = 0.5 * self.scene.material.lame_mu
-        found = kernels.indicators(records, self.body, self.world, solid, 0, len(self.body.mass))
+        found = kernels.indicators(
+            records, self.data, self.parameters, solid, 0, len(self.data.mass)
+        )
         return Indicators(*(float(value) for value in found))
 
     @property
     def fields(self) -> int:
         """Sheets of nodes: two where particles keep a share of their own velocity, else one."""
-        return 2 if self.world.keep > 0.0 else 1
+        return 2 if self.parameters.keep > 0.0 else 1
 
     @property
     def steps(self) -> int:
@@ -239,13 +241,13 @@ class Simulation:
         The initial windows with a quarter to spare on each axis.
         """
         position = np.real(kernels.parts(self.initial).position)
-        most = (self.world.nodes_x, self.world.nodes_y)
+        most = (self.parameters.nodes_x, self.parameters.nodes_y)
 
         def nodes(first: int, last: int) -> int:
-            cells = np.fmin(np.ptp(position[:, first:last], axis=1) / self.world.dx, most)
+            cells = np.fmin(np.ptp(position[:, first:last], axis=1) / self.parameters.dx, most)
             return int(np.prod(np.ceil(1.25 * cells) + 4))
 
-        first = 4 * self.body.first
+        first = 4 * self.data.first
         blocks = max(nodes(a, b) for a, b in pairwise(first))
         return nodes(0, position.shape[1]), blocks
 
@@ -260,7 +262,7 @@ class Simulation:
         StorageError
             If the disk has too little room.
         """
-        groups, dtype = self.body.mass.shape[0], self.initial.dtype
+        groups, dtype = self.data.mass.shape[0], self.initial.dtype
         states, log = (kernels.STATE_SIZE * groups, 4), (groups, 4)
         nodes, _ = self.room
         grid = (self.fields, nodes, kernels.NODE_SIZE)
@@ -275,7 +277,7 @@ class Simulation:
             arrays = {
                 "states": ((length + 1, *states), dtype),
                 "grids": ((length, *grid), dtype),
-                "windows": ((length, len(self.body.first), 4), np.int64),
+                "windows": ((length, len(self.data.first), 4), np.int64),
                 "logs": ((length, *log), dtype),
             }
         return Checkpoints(schedule, arrays, wish.store)
@@ -385,7 +387,7 @@ class Forward:
             return kernels.grouped(seed.astype(dtype), repeat=False)
 
         bar = seed_of(schedule.steps)
-        body_bar = kernels.BodyBar.zeros(len(simulation.body.mass), dtype)
+        data_bar = kernels.ParticleDataBar.zeros(len(simulation.data.mass), dtype)
         signal_bar = np.zeros_like(simulation.signal)
         segments = schedule.segments
         for index in range(len(segments) - 1, -1, -1):
@@ -406,12 +408,12 @@ class Forward:
                     memory.logs,
                     start,
                     stop,
-                    simulation.body,
-                    simulation.world,
+                    simulation.data,
+                    simulation.parameters,
                     simulation.signal[first:last],
                     memory.scratch,
                     bar,
-                    body_bar,
+                    data_bar,
                     part_bar,
                 )
                 stop = start
@@ -419,9 +421,9 @@ class Forward:
                     bar += seed_of(first + start)
             signal_bar[first:last] = part_bar.sum(axis=0)
         return Gradient(
-            density=simulation.particles.volume * kernels.ungrouped(body_bar.mass, 1, shape[1])[0],
-            lame_lambda=kernels.ungrouped(body_bar.lame_lambda, 1, shape[1])[0],
-            lame_mu=kernels.ungrouped(body_bar.lame_mu, 1, shape[1])[0],
+            density=simulation.particles.volume * kernels.ungrouped(data_bar.mass, 1, shape[1])[0],
+            lame_lambda=kernels.ungrouped(data_bar.lame_lambda, 1, shape[1])[0],
+            lame_mu=kernels.ungrouped(data_bar.lame_mu, 1, shape[1])[0],
             signal=signal_bar,
             state=kernels.ungrouped(bar, *shape),
         )

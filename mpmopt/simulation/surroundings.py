@@ -11,10 +11,10 @@ from mpmopt.kernels import contact
 from mpmopt.scene import Scene
 
 
-def world_of(scene: Scene) -> kernels.World:
+def parameters_of(scene: Scene) -> kernels.Parameters:
     """The scene's surroundings as the kernels see them."""
     dx = scene.grid.dx
-    return kernels.World(
+    return kernels.Parameters(
         dt=scene.time_step,
         dx=dx,
         per_dx=1.0 / dx,
