@@ -45,6 +45,10 @@ class FractureError(SimulationError):
     """Solid stretched so far that nothing holds its particles together; no step mends that."""
 
 
+class OverlapError(SimulationError):
+    """Parts of a body that were far apart and came to lie in each other."""
+
+
 class StorageError(MpmoptError, OSError):
     """A file that could not be written or read back, or a disk without room for it."""
 

@@ -263,8 +263,11 @@ def test_an_optimisation_records_steps_and_margins():
         assert (item.halved, item.time_step) == (1, scene.time_step / 2)
         again = plain(problem, item.time_step).evaluate(item.x)
         assert again.value == item.objective
-        indicators = tuple(getattr(item, name) for name in Indicators._fields)
-        assert again.indicators == indicators
+        names = [name for name in Indicators._fields if hasattr(item, name)]  # but for the place
+        assert [getattr(again.indicators, name) for name in names] == [
+            getattr(item, name) for name in names
+        ]
+        assert len(names) == 6
     assert run.problem().scene.time_step == scene.time_step / 2
     assert run.problem().value(run.result.x) == run.result.objective
     left_alone = dataclasses.replace(stage, halvings=0, limited=False)

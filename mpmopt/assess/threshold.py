@@ -22,8 +22,11 @@ THRESHOLD = 0.3  # of gamma, as in the paper
 NO_GAIN = 1e-12  # over the grid's size: what two equal bodies may differ by
 # Beyond a stretch of 1 over the particles per cell some cell has none: a body may crack there. An
 # optimiser may pass through (`LIMITS`), but nothing that went so far counts. What a cut carries
-# depends on this ratio alone, so one particle per cell bears no stretch at all.
-SOLID_LIMITS = LIMITS._replace(courant=np.inf, velocity_increment=np.inf, jacobian=0.0, stretch=1.0)
+# depends on this ratio alone, so one particle per cell bears no stretch at all. Nor does a body
+# count whose parts lie in each other.
+SOLID_LIMITS = LIMITS._replace(
+    courant=np.inf, velocity_increment=np.inf, jacobian=0.0, stretch=1.0, gap=0.5
+)
 
 Baseline = Callable[[NDArray[np.float64]], NDArray[np.bool_]]
 

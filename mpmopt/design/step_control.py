@@ -1,4 +1,4 @@
-"""When an evaluation is rejected and its time step halved, and when solid is torn."""
+"""When an evaluation is rejected and its time step halved, and when solid tears or overlaps."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, TypeVar
 
-from mpmopt.errors import FractureError, SimulationError
+from mpmopt.errors import FractureError, OverlapError, SimulationError
 from mpmopt.simulation.indicators import Indicators
 from mpmopt.simulation.simulation import Simulation
 
@@ -20,7 +20,9 @@ Result = TypeVar("Result")
 
 # An evaluation that goes beyond these is not trusted (docs: theory, "Step control"); the stretch is
 # over the particles per cell and direction.
-LIMITS = Indicators(courant=1.0, velocity_increment=0.5, jacobian=0.01, stretch=1.5, energy=0.05)
+LIMITS = Indicators(
+    courant=1.0, velocity_increment=0.5, jacobian=0.01, stretch=1.5, energy=0.05, gap=0.0
+)
 
 
 def with_halvings(
@@ -31,13 +33,13 @@ def with_halvings(
     Raises
     ------
     SimulationError
-        If the last attempt fails; a `FractureError` at once, as no step mends it.
+        If the last attempt fails; a `FractureError` or `OverlapError` at once, as no step mends it.
     """
     halved = 0
     while True:
         try:
             return evaluate(problem), halved
-        except FractureError:
+        except (FractureError, OverlapError):
             raise
         except SimulationError as error:
             if halved == halvings:
@@ -60,7 +62,8 @@ def check_indicators(indicators: Indicators, simulation: Simulation, limits: Ind
     Raises
     ------
     SimulationError
-        If the step is too long; a `FractureError` if solid is torn, which no step mends.
+        If the step is too long; a `FractureError` if solid is torn and an `OverlapError` if parts
+        of it lie in each other, which no step mends.
     """
     flattest = 1.0 / limits.jacobian if limits.jacobian > 0.0 else math.inf
     for what, value, limit in (
@@ -80,6 +83,16 @@ def check_indicators(indicators: Indicators, simulation: Simulation, limits: Ind
             -1,
             (math.nan, math.nan),
             f"take more particles per cell (now {per_cell}), a stiffer body or weaker actuation",
+        )
+    if not indicators.gap >= limits.gap:
+        raise OverlapError(
+            "parts of the body that were over 4 cells apart lie in each other: solid particles "
+            f"came within {indicators.gap:.3g} of their spacing, the limit is {limits.gap:.3g}",
+            simulation.steps,
+            -1,
+            (indicators.gap_x, indicators.gap_y),
+            f"near ({indicators.gap_x:.4g}, {indicators.gap_y:.4g}) keep parts apart: weaker "
+            "actuation, a stiffer body, or material between them",
         )
 
 

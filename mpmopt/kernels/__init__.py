@@ -59,6 +59,7 @@ from mpmopt.kernels.deformation import deform, deform_adjoint
 from mpmopt.kernels.energy import energy, grips
 from mpmopt.kernels.grid import free_velocity, grid_update, grid_update_adjoint, mirror
 from mpmopt.kernels.indicators import indicators
+from mpmopt.kernels.overlap import closest
 from mpmopt.kernels.spline import (
     expand,
     expand_adjoint,
@@ -103,6 +104,7 @@ __all__ = [
     "advance_adjoint",
     "blend",
     "blend_adjoint",
+    "closest",
     "deform",
     "deform_adjoint",
     "energy",

@@ -50,7 +50,7 @@ class Iteration:
         it failed.
     halved : int
         How often the stage's time step was halved for this evaluation.
-    courant, velocity_increment, jacobian, stretch, energy : float
+    courant, velocity_increment, jacobian, stretch, energy, gap : float
         Its `indicators.Indicators`, or not a number if it failed.
     failure : str
         Why the evaluation failed, or empty.
@@ -74,6 +74,7 @@ class Iteration:
     jacobian: float = np.nan
     stretch: float = np.nan
     energy: float = np.nan
+    gap: float = np.nan
     failure: str = ""
 
     @property

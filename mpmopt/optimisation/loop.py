@@ -332,7 +332,7 @@ class _StageRun:
         value, failure = np.nan, ""
         gradient: NDArray[np.float64] = np.full(x.size, np.nan)
         problem, halved = self.problem, self.problem.halvings
-        indicators = Indicators(*5 * (np.nan,))
+        indicators = Indicators(*len(Indicators._fields) * (np.nan,))
         time_step = problem.scene.time_step / 2.0**halved
         try:
             evaluation = problem.evaluate(x)
@@ -376,6 +376,7 @@ class _StageRun:
             jacobian=indicators.jacobian,
             stretch=indicators.stretch,
             energy=indicators.energy,
+            gap=indicators.gap,
             failure=failure,
         )
         self._record(candidate, gradient)

@@ -1,4 +1,4 @@
-"""How close a run comes to where its time step is too long, or its body tears."""
+"""How close a run comes to where its time step is too long, or its body tears or overlaps."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mpmopt import kernels
 from mpmopt.errors import DesignError
-from mpmopt.simulation.energy import Balance
+from mpmopt.simulation.energy import LOOK, Balance
 from mpmopt.validation import shown
 
 if TYPE_CHECKING:
@@ -41,6 +41,12 @@ class Indicators(NamedTuple):
     energy : float
         Most that energy rose without work, as a share of what the run had to do with
         (`energy.Balance`). No law of motion allows any.
+    gap : float
+        Least distance, in current particle spacings, of particles with half the solid's stiffness
+        or more that were over four cells apart in the reference configuration, at states 0, 64,
+        ... and the last; infinite beyond a cell. Below 1/2 parts of the body lie in each other.
+    gap_x, gap_y : float
+        Where that was, infinite if nowhere.
     """
 
     courant: float = 0.0
@@ -48,6 +54,9 @@ class Indicators(NamedTuple):
     jacobian: float = math.inf
     stretch: float = 0.0
     energy: float = 0.0
+    gap: float = math.inf
+    gap_x: float = math.inf
+    gap_y: float = math.inf
 
     def join(self, other: Indicators) -> Indicators:
         """The indicators of two runs, or of two parts of a run, taken together."""
@@ -57,6 +66,7 @@ class Indicators(NamedTuple):
             min(self.jacobian, other.jacobian),
             max(self.stretch, other.stretch),
             max(self.energy, other.energy),
+            *min(self[5:], other[5:]),
         )
 
 
@@ -101,6 +111,11 @@ class Watcher:
             slots.append(last - first)
         for slot in slots:
             self._seen = self._seen.join(self.simulation.indicators(states[slot]))
+            if (first + slot) % LOOK == 0 or first + slot == self.simulation.steps:
+                gap = self.simulation.gap(states[slot])
+                self._seen = self._seen.join(
+                    self._seen._replace(gap=gap[0], gap_x=gap[1], gap_y=gap[2])
+                )
 
     @property
     def indicators(self) -> Indicators:

@@ -212,12 +212,20 @@ class Simulation:
         return Watched(watcher.states, watcher.indicators)
 
     def indicators(self, records: NDArray) -> Indicators:
-        """Those of a state, as records of groups of particles (`grouped`), but for energy."""
+        """Those of a state, as records of groups (`grouped`), but for energy and gap."""
         solid = 0.5 * self.scene.material.lame_mu
         found = kernels.indicators(
             records, self.data, self.parameters, solid, 0, len(self.data.mass)
         )
         return Indicators(*(float(value) for value in found))
+
+    def gap(self, records: NDArray) -> tuple[float, float, float]:
+        """How near solid that was far apart comes in a state, and where (`kernels.closest`)."""
+        solid = self.data.lame_mu.real >= 0.5 * self.scene.material.lame_mu
+        solid &= self.data.mass.real > 0.0  # others only fill their group
+        reference = kernels.grouped(self.particles.position.T)
+        found = kernels.closest(records, reference, solid, self.data, self.parameters)
+        return tuple(float(value) for value in found)  # type: ignore[return-value]
 
     @property
     def fields(self) -> int:
