@@ -57,8 +57,8 @@ class ParticleData(NamedTuple):
 
     volume: NDArray  # (G, 4) reference volume
     mass: NDArray  # (G, 4)
-    lame_lambda: NDArray  # (G, 4)
-    lame_mu: NDArray  # (G, 4)
+    stiffness: NDArray  # (G, 4) share of the solid's stiffness
+    constants: NDArray  # (P, G, 4) of the solid, in the order of `material.PARAMETERS`
     active: NDArray[np.bool_]  # (G,) whether a group has actuated particles
     actuated: NDArray[np.float64]  # (K, G, 4) 1 for the particles of actuator k, else 0
     actuation_stress: NDArray[np.float64]  # (K, 3) second Piola-Kirchhoff S: xx, xy, yy
@@ -69,8 +69,7 @@ class ParticleDataBar(NamedTuple):
     """Adjoints of `ParticleData`, accumulated over the steps."""
 
     mass: NDArray  # (G, 4)
-    lame_lambda: NDArray  # (G, 4)
-    lame_mu: NDArray  # (G, 4)
+    stiffness: NDArray  # (G, 4)
 
     @classmethod
     def zeros(cls, groups: int, dtype: DTypeLike = float) -> "ParticleDataBar":

@@ -5,16 +5,18 @@ import math
 from mpmopt.kernels.arrays import AFFINE, DEFORMATION, components
 from mpmopt.kernels.compiler import jit
 from mpmopt.kernels.deformation import stretches
-from mpmopt.kernels.material import wave_modulus
+from mpmopt.kernels.material import constants_of_one, wave_modulus
+
+SOLID = 0.5
 
 
 @jit
-def indicators(state, data, parameters, solid, first, last):
+def indicators(state, data, parameters, first, last):
     """How close groups of particles come to where a step is too long, as in `Indicators`.
 
     The largest (dt / dx) sqrt(M / rho) and dt |C|, the smallest J, and the largest stretch of
-    particles whose mu is at least `solid`; M is their `wave_modulus`. Extremes do not depend on the
-    order in which they are taken.
+    particles with `SOLID` of the solid's stiffness or more; M is their `wave_modulus`. Extremes do
+    not depend on the order in which they are taken.
     """
     stiffest = fastest = longest = 0.0
     smallest = math.inf
@@ -22,12 +24,11 @@ def indicators(state, data, parameters, solid, first, last):
         for k in range(4):
             mass, volume = data.mass[g, k].real, data.volume[g, k].real
             if mass > 0.0:  # else it only fills its group
-                mu, lam = data.lame_mu[g, k].real, data.lame_lambda[g, k].real
                 c00, c01, c10, c11 = components(state, g, AFFINE, k)
                 F = components(state, g, DEFORMATION, k)
                 trace, apart = stretches(F)
-                stiffness = wave_modulus(trace, apart, lam, mu)
-                if mu >= solid:
+                stiffness = wave_modulus(trace, apart, constants_of_one(data, g, k))
+                if data.stiffness[g, k].real >= SOLID:
                     longest = max(longest, 0.5 * (trace + math.sqrt(apart)))
                 stiffest = max(stiffest, stiffness * volume / mass)
                 fastest = max(fastest, c00 * c00 + c01 * c01 + c10 * c10 + c11 * c11)

@@ -101,6 +101,16 @@ class Material(Checked):
         """Speed of pressure waves, sqrt((lambda + 2 mu) / rho)."""
         return math.sqrt((self.lame_lambda + 2.0 * self.lame_mu) / self.density)
 
+    @property
+    def modulus(self) -> float:
+        """Stiffness 2 (lambda + mu) that an isolated particle at rest bounds the time step by."""
+        return 2.0 * (self.lame_mu + self.lame_lambda)
+
+    @property
+    def elliptic_limit(self) -> float:
+        """Stress mu: actuation that squeezes by as much takes the law's ellipticity."""
+        return self.lame_mu
+
 
 @dataclass(frozen=True)
 class Region(Checked):

@@ -210,9 +210,8 @@ class Scene(Checked):
         The lightest particle counts: a void one where the void density is below the void stiffness.
         """
         material = self.material
-        stiffness = 2.0 * (material.lame_mu + material.lame_lambda)
         stiffest = max(1.0, material.void_stiffness / material.void_density)
-        return self.grid.dx * math.sqrt(material.density / (stiffness * stiffest))
+        return self.grid.dx * math.sqrt(material.density / (material.modulus * stiffest))
 
     @property
     def courant(self) -> float:
