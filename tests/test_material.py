@@ -41,7 +41,7 @@ def simulation(rng):
 def materials(simulation):
     """lambda, mu, m and V of the particles, and s S (2, 2, N)."""
     data, count = simulation.data, simulation.initial.shape[1]
-    fields = (*data.stiffness * data.constants, data.mass, data.volume)
+    fields = (*data.stiffness * data.constants[:2], data.mass, data.volume)
     sS = np.zeros((2, 2, count))
     for k, actuator in enumerate(simulation.scene.actuators):
         there = simulation.particles.actuator == k

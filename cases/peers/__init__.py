@@ -35,7 +35,7 @@ def clamped(parameters: Parameters) -> tuple[list[int], list[int]]:
 def constants(simulation: Simulation) -> tuple[NDArray, NDArray, NDArray, NDArray]:
     """Volume, mass, lambda and mu (N,) of the particles."""
     data, count = simulation.data, simulation.initial.shape[1]
-    arrays = (data.volume, data.mass, data.stiffness, *data.constants)
+    arrays = (data.volume, data.mass, data.stiffness, *data.constants[:2])
     volume, mass, stiffness, lam, mu = (ungrouped(array, 1, count)[0] for array in arrays)
     return volume, mass, stiffness * lam, stiffness * mu
 
@@ -43,5 +43,5 @@ def constants(simulation: Simulation) -> tuple[NDArray, NDArray, NDArray, NDArra
 def stiffness_bar(simulation: Simulation, lambda_bar: NDArray, mu_bar: NDArray) -> NDArray:
     """The adjoint (N,) of the particles' stiffness, from those of lambda and mu."""
     count = simulation.initial.shape[1]
-    lam, mu = (ungrouped(array, 1, count)[0] for array in simulation.data.constants)
+    lam, mu = (ungrouped(array, 1, count)[0] for array in simulation.data.constants[:2])
     return lam * lambda_bar + mu * mu_bar

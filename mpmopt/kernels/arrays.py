@@ -48,6 +48,7 @@ class Parameters(NamedTuple):
     walls: NDArray[np.float64]  # (W, columns) as `contact` names them
     mirror_axis: int  # of the mirror plane's normal: 0 or 1; -1: no mirror
     mirror_node: int  # line of nodes that is the plane
+    viscous: bool  # whether a material has a viscosity
     keep: float  # share of what the grid smoothed away that particles keep; 0: no blend
     mass_tolerance: float  # mass of a node that is rounding of larger ones: the node is empty
 

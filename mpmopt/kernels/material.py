@@ -12,34 +12,34 @@ from mpmopt.kernels.compiler import jit
 from mpmopt.kernels.simd import load, product
 
 # Attributes of a scene's material, in the order of `ParticleData.constants`.
-PARAMETERS = ("lame_lambda", "lame_mu")
+PARAMETERS = ("lame_lambda", "lame_mu", "viscosity")
 
 
 @jit
 def solid_constants(data, g):
-    """lambda and mu of the solid that a group's particles are made of."""
-    return load(data.constants[0], g), load(data.constants[1], g)
+    """Of the solid that a group's particles are made of."""
+    return load(data.constants[0], g), load(data.constants[1], g), load(data.constants[2], g)
 
 
 @jit
 def constants_of(data, g):
-    """lambda and mu of a group's particles."""
-    lam, mu = solid_constants(data, g)
+    """Of a group's particles."""
+    lam, mu, eta = solid_constants(data, g)
     stiffness = load(data.stiffness, g)
-    return product(stiffness, lam), product(stiffness, mu)
+    return product(stiffness, lam), product(stiffness, mu), product(stiffness, eta)
 
 
 @jit
 def constants_of_one(data, g, k):
-    """lambda and mu of particle k of group g, real parts."""
-    stiffness = float(data.stiffness[g, k].real)
-    return stiffness * float(data.constants[0, g, k]), stiffness * float(data.constants[1, g, k])
+    """Of particle k of group g, real parts."""
+    stiffness, solid = float(data.stiffness[g, k].real), data.constants[:, g, k]
+    return stiffness * float(solid[0]), stiffness * float(solid[1]), stiffness * float(solid[2])
 
 
 @jit
 def energy_density(F, log_J, constants):
     """Psi = mu/2 (tr F^T F - 2) - mu ln J + lambda/2 ln^2 J, per volume of the reference."""
-    lam, mu = constants
+    lam, mu = constants[:2]
     f00, f01, f10, f11 = F
     trace = f00 * f00 + f01 * f01 + f10 * f10 + f11 * f11
     return 0.5 * mu * (trace - 2.0) - mu * log_J + 0.5 * lam * log_J**2
@@ -48,7 +48,7 @@ def energy_density(F, log_J, constants):
 @jit
 def kirchhoff(F, log_J, constants):
     """Kirchhoff stress tau = mu (F F^T - I) + lambda ln J I: xx, xy, yy."""
-    lam, mu = constants
+    lam, mu = constants[:2]
     f00, f01, f10, f11 = F
     spherical = lam * log_J - mu
     t00 = mu * (f00 * f00 + f01 * f01) + spherical
@@ -60,7 +60,7 @@ def kirchhoff(F, log_J, constants):
 @jit
 def kirchhoff_adjoint(F, log_J, constants, tau_bar):
     """F_bar = (T + T^T) F mu + lambda tr T F^-T with T = tau_bar; its xy counts xy and yx."""
-    lam, mu = constants
+    lam, mu = constants[:2]
     f00, f01, f10, f11 = F
     t00, t01, t11 = tau_bar
     pressure = lam * (t00 + t11) / (f00 * f11 - f01 * f10)
@@ -79,5 +79,5 @@ def wave_modulus(trace, apart, constants):
     lambda + mu tr b + sqrt(mu^2 apart + lambda^2) with b = F F^T, as `stretches` gives tr b and
     apart; M / rho is the square of the fastest wave's speed in the reference configuration.
     """
-    lam, mu = constants
+    lam, mu = constants[:2]
     return lam + mu * trace + np.sqrt(mu * mu * apart + lam * lam)
