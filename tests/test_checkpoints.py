@@ -255,8 +255,7 @@ def test_windows_that_outgrow_the_store_are_recomputed():
         state[0:2] = particles.position.T
         state[2:4] = [[9.0], [14.0]] * (state[0:2] - state[0:2].mean(axis=1, keepdims=True))
         state[[8, 11]] = 1.0
-        weak = 1e-9 * ones
-        simulation = Simulation(scene, particles, ones, weak, weak, np.zeros((40, 2)), state)
+        simulation = Simulation(scene, particles, ones, 1e-10 * ones, np.zeros((40, 2)), state)
         with simulation.checkpoints(Checkpointing(every, store="memory")) as checkpoints:
             forward = simulation.forward(checkpoints)
             objective = Objective.of(scene, particles, (0.6, 0.8))

@@ -66,8 +66,7 @@ def solid_body(
         scene,
         particles,
         density=material.density * ones,
-        lame_lambda=material.lame_lambda * ones,
-        lame_mu=material.lame_mu * ones,
+        stiffness=ones,
         signal=signal(scene, variables.a, variables.theta, variables.b),
     )
     return simulation, Objective.of(scene, particles)

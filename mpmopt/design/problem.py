@@ -233,8 +233,7 @@ class Problem:
             self.scene,
             self.particles.subset(present),
             field.density[present],
-            field.lame_lambda[present],
-            field.lame_mu[present],
+            field.stiffness[present],
             signal(self.scene, a, theta, b),
             precision=self.precision,
         )
@@ -327,8 +326,8 @@ class Problem:
             self._check(forward.indicators, simulation)
             value = float(_finite(objective.value(forward.states), simulation))
             gradient = forward.reverse(objective.terminal_adjoints(forward.states))
-        bars = np.zeros((3, len(self.particles.position)))
-        bars[:, self.present(phi)] = gradient.density, gradient.lame_lambda, gradient.lame_mu
+        bars = np.zeros((2, len(self.particles.position)))
+        bars[:, self.present(phi)] = gradient.density, gradient.stiffness
         phi_bar = self.chain.field(phi).pullback(*bars)
         parts = phi_bar, *signal_adjoint(self.scene, a, theta, gradient.signal)
         whole = _finite(np.concatenate(parts), simulation)

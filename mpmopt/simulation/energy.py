@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mpmopt.kernels import energy, grips
+from mpmopt.kernels import energy, grips, plain, wave_modulus
 
 # The balance is struck once in so many steps, and at the end.
 LOOK = 64
@@ -43,7 +43,8 @@ class Balance:
         self._last: tuple[float, float] | None = None
         self._lowest, self._rise, self._turnover = math.inf, 0.0, 0.0
         # What is rounding only: of strains, and of positions in gravity.
-        modulus = float((data.volume.real * (data.lame_lambda.real + 2 * data.lame_mu.real)).sum())
+        constants = data.stiffness.real * data.constants
+        modulus = float((data.volume.real * plain(wave_modulus)(2.0, 0.0, constants)).sum())
         weight = float(data.mass.real.sum()) * math.hypot(
             parameters.gravity_x, parameters.gravity_y
         )

@@ -29,8 +29,8 @@ class Indicators(NamedTuple):
     Attributes
     ----------
     courant : float
-        Largest (dt / dx) sqrt(M / rho) with the stiffness M of the stretched particle. An isolated
-        particle is unstable above 1.
+        Largest (dt / dx) sqrt(M / rho) with the stiffness M of the stretched particle, more where
+        it is viscous (docs: theory, "Step control"). An isolated particle is unstable above 1.
     velocity_increment : float
         Largest dt |C|, the Frobenius norm. Below 1 no particle can be inverted by a step.
     jacobian : float

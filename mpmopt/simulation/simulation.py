@@ -45,15 +45,14 @@ class Gradient:
 
     Attributes
     ----------
-    density, lame_lambda, lame_mu : (N,) arrays
+    density, stiffness : (N,) arrays
     signal : (steps, K) array
     state : (12, N) array
         With respect to the initial state.
     """
 
     density: NDArray[np.float64]
-    lame_lambda: NDArray[np.float64]
-    lame_mu: NDArray[np.float64]
+    stiffness: NDArray[np.float64]
     signal: NDArray[np.float64]
     state: NDArray[np.float64]
 
@@ -67,8 +66,8 @@ class Simulation:
         Grid, time, walls, gravity, and the actuators' stresses.
     particles : Particles
         N of them.
-    density, lame_lambda, lame_mu : (N,) arrays
-        Real, or complex for the complex step.
+    density, stiffness : (N,) arrays
+        Mass density, and share of the solid's stiffness. Real, or complex for the complex step.
     signal : (steps, K) array
         Of the scene's K actuators; real or complex.
     state : (12, N) array, optional
@@ -87,8 +86,7 @@ class Simulation:
         scene: Scene,
         particles: Particles,
         density: NDArray,
-        lame_lambda: NDArray,
-        lame_mu: NDArray,
+        stiffness: NDArray,
         signal: NDArray,
         state: NDArray | None = None,
         precision: Precision = "double",
@@ -101,8 +99,7 @@ class Simulation:
             x[:], F[0, 0], F[1, 1] = particles.position.T, 1.0, 1.0
         shapes = {
             "density": (density, (count,)),
-            "lame_lambda": (lame_lambda, (count,)),
-            "lame_mu": (lame_mu, (count,)),
+            "stiffness": (stiffness, (count,)),
             "signal": (signal, (scene.steps, len(scene.actuators))),
             "state": (state, (kernels.STATE_SIZE, count)),
         }
@@ -118,7 +115,7 @@ class Simulation:
                 raise DesignError(f"{name} holds {np.sum(~np.isfinite(array))} values not finite")
         if count == 0:
             raise DesignError("the body has no particles")
-        dtype = np.result_type(density, lame_lambda, lame_mu, signal, state, float)
+        dtype = np.result_type(density, stiffness, signal, state, float)
         if precision == "single" and dtype.kind == "f":
             dtype = np.dtype(np.float32)
         if not np.real(density).min() > 0.0:
@@ -132,11 +129,14 @@ class Simulation:
         self.parameters = parameters_of(scene)._replace(mass_tolerance=mass_tolerance)
         actuator = kernels.grouped(particles.actuator)
         stress = [(S[0][0], S[0][1], S[1][1]) for S in (a.stress for a in scene.actuators)]
+        solid = [getattr(scene.material, name) for name in kernels.PARAMETERS]
+        constants = np.empty((len(solid), *actuator.shape), real)
+        constants[:] = np.reshape(solid, (-1, 1, 1))
         self.data = kernels.ParticleData(
             volume=kernels.grouped(particles.volume.astype(dtype), repeat=False),
             mass=kernels.grouped((particles.volume * density).astype(dtype), repeat=False),
-            lame_lambda=kernels.grouped(np.asarray(lame_lambda, dtype=dtype)),
-            lame_mu=kernels.grouped(np.asarray(lame_mu, dtype=dtype)),
+            stiffness=kernels.grouped(np.asarray(stiffness, dtype=dtype)),
+            constants=constants,
             active=np.any(actuator >= 0, axis=1),
             actuated=(actuator == np.arange(len(stress))[:, None, None]).astype(real),
             actuation_stress=np.array(stress, dtype=float).reshape(-1, 3),
@@ -213,15 +213,12 @@ class Simulation:
 
     def indicators(self, records: NDArray) -> Indicators:
         """Those of a state, as records of groups (`grouped`), but for energy and gap."""
-        solid = 0.5 * self.scene.material.lame_mu
-        found = kernels.indicators(
-            records, self.data, self.parameters, solid, 0, len(self.data.mass)
-        )
+        found = kernels.indicators(records, self.data, self.parameters, 0, len(self.data.mass))
         return Indicators(*(float(value) for value in found))
 
     def gap(self, records: NDArray) -> tuple[float, float, float]:
         """How near solid that was far apart comes in a state, and where (`kernels.closest`)."""
-        solid = self.data.lame_mu.real >= 0.5 * self.scene.material.lame_mu
+        solid = self.data.stiffness.real >= 0.5
         solid &= self.data.mass.real > 0.0  # others only fill their group
         reference = kernels.grouped(self.particles.position.T)
         found = kernels.closest(records, reference, solid, self.data, self.parameters)
@@ -430,8 +427,7 @@ class Forward:
             signal_bar[first:last] = part_bar.sum(axis=0)
         return Gradient(
             density=simulation.particles.volume * kernels.ungrouped(data_bar.mass, 1, shape[1])[0],
-            lame_lambda=kernels.ungrouped(data_bar.lame_lambda, 1, shape[1])[0],
-            lame_mu=kernels.ungrouped(data_bar.lame_mu, 1, shape[1])[0],
+            stiffness=kernels.ungrouped(data_bar.stiffness, 1, shape[1])[0],
             signal=signal_bar,
             state=kernels.ungrouped(bar, *shape),
         )
