@@ -213,7 +213,7 @@ def test_what_no_step_cures_is_an_error():
         problem.evaluate(x)
 
 
-def test_a_simulation_that_fails_is_redone_too():
+def test_a_simulation_that_fails_is_repeated_too():
     # With a longer step the dropped body is inverted when it meets the floor.
     scene = dataclasses.replace(dropped().scene, time_step=1.2e-2, steps=16)
     problem = Problem(scene, 2.0)

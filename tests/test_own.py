@@ -55,11 +55,11 @@ def results(simulation, every, change=lambda: None, memory=None):
     with simulation.checkpoints(Checkpointing(every=every)) as store:
         objective = Objective.of(SCENE, simulation.particles)
         forward = simulation.forward(store, memory, objective.instants)
-        seeds = objective.terminal_adjoints(forward.states)
+        terminal_adjoints = objective.terminal_adjoints(forward.states)
         value = objective.value(forward.states)
         change()
         spoil(*forward.states.values())
-        gradient = forward.reverse(seeds)
+        gradient = forward.reverse(terminal_adjoints)
     return [np.array(value), *arrays(gradient).values()]
 
 

@@ -1,6 +1,5 @@
 """Kelvin-Voigt viscosity: its stress and adjoint, the power it takes, and the laws it obeys."""
 
-
 import numpy as np
 import pytest
 from conftest import small_scene, worst

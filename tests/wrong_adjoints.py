@@ -128,8 +128,8 @@ def main() -> None:
             "transient forgotten",
             simulation.Forward,
             "reverse",
-            lambda self, seeds, reverse=simulation.Forward.reverse: reverse(
-                self, {max(seeds): seeds[max(seeds)]}
+            lambda self, terminal_adjoints, reverse=simulation.Forward.reverse: reverse(
+                self, {max(terminal_adjoints): terminal_adjoints[max(terminal_adjoints)]}
             ),
         ),
         (

@@ -96,9 +96,7 @@ class Material(Checked):
         for name in ("lame_lambda", "viscosity"):
             self._set(**{name: number("Material", name, getattr(self, name))})
             if getattr(self, name) < 0.0:
-                raise SceneError(
-                    f"Material: {name} = {getattr(self, name)!r} must not be negative"
-                )
+                raise SceneError(f"Material: {name} = {getattr(self, name)!r} must not be negative")
         for name in ("void_stiffness", "void_density"):
             if getattr(self, name) > 1.0:
                 raise SceneError(f"Material: {name} = {getattr(self, name)!r} must be at most 1")

@@ -14,7 +14,7 @@ LOOK = 64
 # the mean signal, its work is known to the square of that over twelve.
 SIGNAL_CHANGE = 0.2
 # Units in the last place that energies of few particles are off by, several times.
-ROUNDING = 64.0
+ENERGY_ULPS = 64.0
 
 
 class Balance:
@@ -49,7 +49,9 @@ class Balance:
             parameters.gravity_x, parameters.gravity_y
         )
         height = parameters.dx * max(parameters.nodes_x, parameters.nodes_y)
-        self._rounding = ROUNDING * float(np.finfo(signal.dtype).eps) * (modulus + weight * height)
+        self._rounding = (
+            ENERGY_ULPS * float(np.finfo(signal.dtype).eps) * (modulus + weight * height)
+        )
 
     def follow(self, states: NDArray, first: int, last: int) -> None:
         """Take in steps `first` to `last`, whose states are in slots 0, 1, ..."""

@@ -37,7 +37,7 @@ class Indicators(NamedTuple):
         Smallest J = det F.
     stretch : float
         Largest singular value of F among particles with half the solid's stiffness or more. Solid
-        is torn where it exceeds the particles per cell and direction by far.
+        is fractured where it exceeds the particles per cell and direction by far.
     energy : float
         Most that energy rose without work, as a share of what the run had to do with
         (`energy.Balance`). No law of motion allows any.

@@ -356,12 +356,12 @@ class Forward:
             return len(self._memory.recomputed)
         return len(schedule.segments) - 1
 
-    def reverse(self, seeds: Mapping[int, NDArray[np.float64]]) -> Gradient:
+    def reverse(self, terminal_adjoints: Mapping[int, NDArray[np.float64]]) -> Gradient:
         """Go back through all steps from a function's derivatives by states.
 
         Parameters
         ----------
-        seeds : mapping of int to (12, N) array
+        terminal_adjoints : mapping of int to (12, N) array
             Derivatives by the states after so many steps, any of them from 0 to the last.
 
         Raises
@@ -379,17 +379,17 @@ class Forward:
         simulation, memory = self._simulation, self._memory
         schedule = self._checkpoints.schedule
         shape, dtype = simulation.initial.shape, simulation.initial.dtype
-        for step, seed in seeds.items():
-            if not 0 <= step <= schedule.steps or np.shape(seed) != shape:
+        for step, terminal in terminal_adjoints.items():
+            if not 0 <= step <= schedule.steps or np.shape(terminal) != shape:
                 raise DesignError(
-                    f"seeds has shape {np.shape(seed)} at step {step}, must have {shape} at steps "
-                    f"from 0 to {schedule.steps}"
+                    f"terminal_adjoints has shape {np.shape(terminal)} at step {step}, must have "
+                    f"{shape} at steps from 0 to {schedule.steps}"
                 )
         self._reversed = True
 
         def seed_of(step: int) -> NDArray:
-            seed = seeds[step] if step in seeds else np.zeros(shape)
-            return kernels.grouped(seed.astype(dtype), repeat=False)
+            terminal = terminal_adjoints[step] if step in terminal_adjoints else np.zeros(shape)
+            return kernels.grouped(terminal.astype(dtype), repeat=False)
 
         bar = seed_of(schedule.steps)
         data_bar = kernels.ParticleDataBar.zeros(len(simulation.data.mass), dtype)
@@ -402,7 +402,7 @@ class Forward:
             part_bar = np.zeros((memory.blocks, *signal_bar[first:last].shape), dtype)
             stop = last - first
             while stop > 0:
-                earlier = (step - first for step in seeds if step < first + stop)
+                earlier = (step - first for step in terminal_adjoints if step < first + stop)
                 start = max(0, stop - simulation.steps_per_call, *earlier)
                 in_parallel(
                     memory.blocks,
@@ -422,7 +422,7 @@ class Forward:
                     part_bar,
                 )
                 stop = start
-                if first + start in seeds:
+                if first + start in terminal_adjoints:
                     bar += seed_of(first + start)
             signal_bar[first:last] = part_bar.sum(axis=0)
         return Gradient(
