@@ -185,7 +185,7 @@ def check_stability(scene: Scene) -> None:
         raise SceneError(
             f"Scene: time_step = {scene.time_step:g} is over the stability limit "
             f"{scene.largest_time_step:g} of a single particle; take a smaller step, larger "
-            "cells or a void density that is not below the void stiffness"
+            "cells, a void density that is not below the void stiffness, or less viscosity"
         )
     for actuator in scene.actuators:
         largest = LARGEST_SIGNAL * np.abs(np.linalg.eigvalsh(actuator.stress)).max()
