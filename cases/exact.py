@@ -7,7 +7,7 @@ import numpy as np
 from mpmopt import kernels
 from mpmopt.design.objective import Objective
 from mpmopt.scene import Grid, Material, Mirror, Scene, Solid
-from mpmopt.scene.particles import discretise
+from mpmopt.scene.particles import discretise, of_solid
 from mpmopt.simulation.checkpoints import Checkpointing
 from mpmopt.simulation.simulation import Simulation
 from mpmopt.simulation.surroundings import parameters_of
@@ -16,10 +16,9 @@ from mpmopt.simulation.surroundings import parameters_of
 def solid_simulation(scene, particles=None, state=None, precision="double"):
     particles = particles or discretise(scene)
     ones = np.ones(len(particles.position))
-    material = scene.material
     signal = np.zeros((scene.steps, len(scene.actuators)))
     return Simulation(
-        scene, particles, material.density * ones, ones, signal, state, precision
+        scene, particles, of_solid(scene, particles, "density"), ones, signal, state, precision
     )  # fmt: skip
 
 

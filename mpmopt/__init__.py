@@ -16,6 +16,7 @@ _HOMES = {
     "Actuator": "mpmopt.scene",
     "Wall": "mpmopt.scene",
     "Mirror": "mpmopt.scene",
+    "SILICONES": "mpmopt.scene",
     "Problem": "mpmopt.design.problem",
     "Settings": "mpmopt.optimisation.settings",
     "Stage": "mpmopt.optimisation.settings",
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
     from mpmopt.optimisation.settings import Settings as Settings
     from mpmopt.optimisation.settings import Stage as Stage
     from mpmopt.results.runfile import read_run as read_run
+    from mpmopt.scene import SILICONES as SILICONES
     from mpmopt.scene import Actuator as Actuator
     from mpmopt.scene import Design as Design
     from mpmopt.scene import Grid as Grid

@@ -134,7 +134,7 @@ def test_a_case_starts_where_it_says(tmp_path, monkeypatch):
 def test_a_baseline_is_kept_for_each_coarsening_of_the_stages(tmp_path, monkeypatch):
     monkeypatch.setattr(case, "_go_on", lambda path, kept, checkpointing: kept.baseline)
     stages = (dataclasses.replace(STAGE, coarsening=2, time_step=4e-3, solid=False), STAGE)
-    twice = [
+    twice: list[dict[str, Any]] = [
         {name: tuple(2 * k for k in getattr(part, name)) for name in ("lower", "upper")}
         for part in SCENE.body
     ]

@@ -79,7 +79,7 @@ class Discretisation:
         if nx != round(nx) or ny != round(ny):
             raise SceneError(f"{multiple:g} times {scene.grid.cells} cells is no whole number")
         courant = scene.courant if courant is None else courant
-        steps = scene.duration * scene.material.wave_speed * multiple / scene.grid.dx / courant
+        steps = scene.duration * scene.wave_speed * multiple / scene.grid.dx / courant
         cells = round(nx), round(ny)
         own = cls(cells, math.ceil(steps - 1e-6), scene.particles_per_cell, mirror=scene.mirror)
         return replace(own, **changes)

@@ -14,7 +14,7 @@ from mpmopt.design.problem import Problem, Variables
 from mpmopt.design.step_control import LIMITS, check_indicators
 from mpmopt.errors import DesignError, SimulationError
 from mpmopt.scene import Scene
-from mpmopt.scene.particles import discretise
+from mpmopt.scene.particles import discretise, of_solid
 from mpmopt.simulation.simulation import Simulation
 from mpmopt.validation import shown
 
@@ -61,11 +61,10 @@ def solid_body(
     there[particles.designed] = keep
     particles = particles.subset(there)
     ones = np.ones(there.sum())
-    material = scene.material
     simulation = Simulation(
         scene,
         particles,
-        density=material.density * ones,
+        density=of_solid(scene, particles, "density"),
         stiffness=ones,
         signal=signal(scene, variables.a, variables.theta, variables.b),
     )

@@ -26,7 +26,7 @@ from mpmopt.design.problem import Problem
 from mpmopt.errors import DesignError
 from mpmopt.kernels import Parts, parts
 from mpmopt.scene import Scene, Wall
-from mpmopt.scene.particles import discretise
+from mpmopt.scene.particles import discretise, of_solid
 from mpmopt.simulation.simulation import Simulation
 from mpmopt.simulation.surroundings import parameters_of
 from mpmopt.validation import count
@@ -190,7 +190,7 @@ class _Bench:
         sample = Simulation(
             scene,
             self.particles,
-            scene.material.density * vary,
+            of_solid(scene, self.particles, "density") * vary,
             vary[::-1],
             np.full((scene.steps, len(scene.actuators)), 0.7),
             self.state,

@@ -39,8 +39,8 @@ MOST_PARTS = 1000  # of the body, and walls
 class Scene(Checked):
     """One body, what surrounds it, and the way it shall go.
 
-    Units are free but must agree: with metres, seconds and kilograms per square metre, stresses
-    are in newtons per metre.
+    Units are free but must agree: with metres, seconds and kilograms per cubic metre, stresses are
+    in pascals, and forces and energies are those of a metre of depth.
 
     Parameters
     ----------
@@ -53,6 +53,7 @@ class Scene(Checked):
         `Design`, `Solid` and `Actuator` rectangles that do not overlap.
     walls : tuple of Wall, optional
     material : Material, optional
+        Of the regions that have none of their own.
     gravity : (float, float), optional
     direction : (float, float), optional
         Unit vector e of the objective.
@@ -206,12 +207,26 @@ class Scene(Checked):
     @property
     def largest_time_step(self) -> float:
         """Stability limit of an isolated particle (`Material.largest_time_step`)."""
-        return self.material.largest_time_step(self.grid.dx)
+        return min(material.largest_time_step(self.grid.dx) for material in self.materials)
 
     @property
     def courant(self) -> float:
-        """Courant number of pressure waves in the solid, c_p dt / dx."""
-        return self.material.wave_speed * self.time_step / self.grid.dx
+        """Courant number of pressure waves in the solid, c_p dt / dx; the fastest count."""
+        return self.wave_speed * self.time_step / self.grid.dx
+
+    @property
+    def wave_speed(self) -> float:
+        """Speed of the fastest pressure waves (`Material.wave_speed`)."""
+        return max(material.wave_speed for material in self.materials)
+
+    @property
+    def materials(self) -> tuple[Material, ...]:
+        """What the body is made of, each once."""
+        return tuple(dict.fromkeys(self.material_of(region) for region in self.body))
+
+    def material_of(self, region: Region) -> Material:
+        """A region's own material, or the scene's."""
+        return self.material if region.material is None else region.material
 
     @property
     def actuators(self) -> tuple[Actuator, ...]:
@@ -266,6 +281,8 @@ class Scene(Checked):
     ) -> Scene:
         """The same scene and duration with another time step, other floors, or wider cells.
 
+        Floors are those of all materials.
+
         Parameters
         ----------
         time_step, void_density, void_stiffness : float, optional
@@ -281,6 +298,12 @@ class Scene(Checked):
         floors = {"void_density": void_density, "void_stiffness": void_stiffness}
         given = {name: value for name, value in floors.items() if value is not None}
         steps, material = self.steps, dataclasses.replace(self.material, **given)
+        body = tuple(
+            region
+            if region.material is None
+            else dataclasses.replace(region, material=dataclasses.replace(region.material, **given))
+            for region in self.body
+        )
         if time_step is None:
             time_step = self.time_step
         else:
@@ -303,7 +326,7 @@ class Scene(Checked):
         nx, ny = (n // coarsening for n in self.grid.cells)
         grid = Grid((nx, ny), self.grid.dx * coarsening)
         return dataclasses.replace(
-            self, grid=grid, time_step=time_step, steps=steps, material=material
+            self, grid=grid, time_step=time_step, steps=steps, body=body, material=material
         )
 
     def to_json(self) -> str:

@@ -56,6 +56,8 @@ def parsed(scene_type: type, text: str) -> Any:
             kind = item.pop("kind", None)
             if not isinstance(kind, str) or kind not in kinds:
                 raise SceneError(f"Region: kind = {shown(kind)} must be one of {sorted(kinds)}")
+            if item.get("material") is not None:
+                item["material"] = _build(Material, item["material"])
             regions.append(_build(kinds[kind], item))
         data["body"] = tuple(regions)
     if "walls" in data:
