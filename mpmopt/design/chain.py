@@ -183,7 +183,7 @@ class Field:
     def pullback(
         self, density_bar: NDArray, stiffness_bar: NDArray, gamma_bar: NDArray | float = 0.0
     ) -> NDArray:
-        """phi_bar (D,) from the adjoints of density and stiffness (N,), and of gamma (D,) itself."""
+        """phi_bar (D,) from the adjoints of density and stiffness (N,), and of gamma (D,)."""
         chain = self.chain
         through = interpolate_adjoint(chain.material, density_bar, stiffness_bar)
         gamma_bar = through[chain.designed] + gamma_bar

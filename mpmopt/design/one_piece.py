@@ -17,6 +17,7 @@ from mpmopt.scene import Scene
 from mpmopt.scene.particles import discretise
 
 LEAST_CONDUCTIVITY = 1e-3  # of an edge, over that between solid particles
+NOTHING = 1e-12  # f of a design without material, so that it has a logarithm
 
 
 class _Lattice(NamedTuple):
@@ -43,7 +44,8 @@ class OnePiece(Term):
 
     def value(self, outcome: Outcome) -> Any:
         lattice = _lattice(outcome.simulation.scene)
-        return np.log(outcome.gamma @ _temperature(lattice, outcome.gamma) / lattice.full)
+        f = outcome.gamma @ _temperature(lattice, outcome.gamma) / lattice.full
+        return np.log(f + NOTHING)
 
     def adjoints(self, outcome: Outcome) -> Adjoints:
         gamma, lattice = outcome.gamma, _lattice(outcome.simulation.scene)
@@ -53,7 +55,7 @@ class OnePiece(Term):
         drop = (1.0 - LEAST_CONDUCTIVITY) * (t[a] - t[b]) ** 2
         # d(q.T) = 2 T.dq - T.dK T: the problem is its own adjoint.
         lost = np.bincount(a, drop * g[b], designed + 1) + np.bincount(b, drop * g[a], designed + 1)
-        return Adjoints(gamma=(2.0 * T - lost[:designed]) / (gamma @ T))
+        return Adjoints(gamma=(2.0 * T - lost[:designed]) / (gamma @ T + NOTHING * lattice.full))
 
 
 @lru_cache(maxsize=4)

@@ -369,12 +369,13 @@ class Problem:
     ) -> NDArray[np.float64]:
         """The gradient (D + 3 K,) of a term, from its adjoints and the sweep that they began."""
         phi, a, theta, _ = variables
-        whole = np.zeros((2, len(self.particles.position)))
+        density_bar, stiffness_bar = np.zeros((2, len(self.particles.position)))
         signal_bar = np.zeros((self.scene.steps, a.size)) + bars.signal
         if sweep is not None:
-            whole[:, self.present(phi)] = sweep.density, sweep.stiffness
+            present = self.present(phi)
+            density_bar[present], stiffness_bar[present] = sweep.density, sweep.stiffness
             signal_bar = sweep.signal + bars.signal
-        phi_bar = self.chain.field(phi).pullback(*whole, bars.gamma)
+        phi_bar = self.chain.field(phi).pullback(density_bar, stiffness_bar, bars.gamma)
         return np.concatenate([phi_bar, *signal_adjoint(self.scene, a, theta, signal_bar)])
 
     def _check(self, indicators: Indicators, simulation: Simulation) -> None:
