@@ -91,6 +91,13 @@ def test_of_designs_that_miss_a_constraint_the_nearest_is_the_best(monkeypatch):
     assert re.search(r"Volume\(\) at most 0.5 is missed by 0.1\.$", run.stop_reason)
 
 
+def test_the_result_meets_constraints_though_a_sharper_stage_goes_farther(monkeypatch):
+    settings = Settings((STAGE, STAGE), most_iterations=2, tolerance=0.0)
+    run = told(monkeypatch, [(1.0, 0.5), (2.0, 0.6), (3.0, 0.6), (4.0, 0.6)], BOUND, settings)
+    assert set(run.best) == {0, 1}
+    assert (run.result.stage, run.result.objective) == (0, 1.0)
+
+
 def test_a_failure_goes_back_to_the_best_that_meets_the_constraints(monkeypatch):
     rows = [(9.0, 0.8), (1.0, 0.4), None, (2.0, 0.4), (3.0, 0.4), (3.0, 0.4)]
     run = told(monkeypatch, rows, BOUND, FIVE)

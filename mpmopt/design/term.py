@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mpmopt.errors import DesignError
 from mpmopt.scene import Scene
+from mpmopt.scene.parts import Checked
 from mpmopt.simulation.simulation import Simulation
-
-if TYPE_CHECKING:
-    from mpmopt.design.terms import Sum
+from mpmopt.validation import number, shown
 
 
 @dataclass(frozen=True)
@@ -78,16 +78,53 @@ class Term:
         raise NotImplementedError
 
     def __add__(self, other: Term) -> Sum:
-        from mpmopt.design.terms import Sum
-
         return Sum(((1.0, self), (1.0, other)))
 
     def __mul__(self, weight: float) -> Sum:
-        from mpmopt.design.terms import Sum
-
         return Sum(((weight, self),))
 
     def __sub__(self, other: Term) -> Sum:
         return self + -1.0 * other
 
     __rmul__ = __mul__
+
+
+@dataclass(frozen=True)
+class Sum(Term, Checked):
+    """Terms times weights, added.
+
+    Parameters
+    ----------
+    terms : tuple of (float, Term)
+        Weights and terms.
+    """
+
+    terms: tuple[tuple[float, Term], ...]
+
+    def __post_init__(self) -> None:
+        pairs: Any = self.terms
+        try:
+            whole = [(weight, term) for weight, term in pairs if isinstance(term, Term)]
+        except (TypeError, ValueError):
+            whole = []
+        if not whole or len(whole) != len(pairs):
+            raise DesignError(f"Sum: terms = {shown(pairs)} must be pairs of a weight and a Term")
+        weights = [number("Sum", "weight", weight, error=DesignError) for weight, _ in whole]
+        self._set(terms=tuple(zip(weights, (term for _, term in whole))))
+
+    def instants(self, scene: Scene) -> tuple[int, ...]:
+        return tuple(sorted({step for _, term in self.terms for step in term.instants(scene)}))
+
+    def value(self, outcome: Outcome) -> Any:
+        return sum(weight * term.value(outcome) for weight, term in self.terms)
+
+    def adjoints(self, outcome: Outcome) -> Adjoints:
+        states: dict[int, NDArray[np.float64]] = {}
+        signal: Any = 0.0
+        gamma: Any = 0.0
+        for weight, term in self.terms:
+            bars = term.adjoints(outcome)
+            for step, bar in bars.states.items():
+                states[step] = weight * bar + states.get(step, 0.0)
+            signal, gamma = signal + weight * bars.signal, gamma + weight * bars.gamma
+        return Adjoints(states, signal, gamma)

@@ -6,15 +6,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mpmopt.design.objective import Objective
 from mpmopt.design.one_piece import OnePiece
-from mpmopt.design.term import Adjoints, Outcome, Term
+from mpmopt.design.term import Adjoints, Outcome, Sum, Term
 from mpmopt.errors import DesignError
 from mpmopt.scene import Scene
 from mpmopt.scene.parts import Checked, Vector, vector
-from mpmopt.validation import number, shown
+from mpmopt.validation import number
 
 
 def _centroid(outcome: Outcome, direction: Vector | None) -> Objective:
@@ -126,47 +125,6 @@ class Volume(Term):
 
     def adjoints(self, outcome: Outcome) -> Adjoints:
         return Adjoints(gamma=np.full(outcome.gamma.size, 1.0 / max(outcome.gamma.size, 1)))
-
-
-@dataclass(frozen=True)
-class Sum(Term, Checked):
-    """Terms times weights, added.
-
-    Parameters
-    ----------
-    terms : tuple of (float, Term)
-        Weights and terms.
-    """
-
-    terms: tuple[tuple[float, Term], ...]
-
-    def __post_init__(self) -> None:
-        pairs: Any = self.terms
-        try:
-            whole = [(weight, term) for weight, term in pairs if isinstance(term, Term)]
-        except (TypeError, ValueError):
-            whole = []
-        if not whole or len(whole) != len(pairs):
-            raise DesignError(f"Sum: terms = {shown(pairs)} must be pairs of a weight and a Term")
-        weights = [number("Sum", "weight", weight, error=DesignError) for weight, _ in whole]
-        self._set(terms=tuple(zip(weights, (term for _, term in whole))))
-
-    def instants(self, scene: Scene) -> tuple[int, ...]:
-        return tuple(sorted({step for _, term in self.terms for step in term.instants(scene)}))
-
-    def value(self, outcome: Outcome) -> Any:
-        return sum(weight * term.value(outcome) for weight, term in self.terms)
-
-    def adjoints(self, outcome: Outcome) -> Adjoints:
-        states: dict[int, NDArray[np.float64]] = {}
-        signal: Any = 0.0
-        gamma: Any = 0.0
-        for weight, term in self.terms:
-            bars = term.adjoints(outcome)
-            for step, bar in bars.states.items():
-                states[step] = weight * bar + states.get(step, 0.0)
-            signal, gamma = signal + weight * bars.signal, gamma + weight * bars.gamma
-        return Adjoints(states, signal, gamma)
 
 
 # What a run file can name.
