@@ -18,6 +18,13 @@ _HOMES = {
     "Mirror": "mpmopt.scene",
     "SILICONES": "mpmopt.scene",
     "Problem": "mpmopt.design.problem",
+    "Task": "mpmopt.design.task",
+    "AtMost": "mpmopt.design.task",
+    "Displacement": "mpmopt.design.terms",
+    "Speed": "mpmopt.design.terms",
+    "Effort": "mpmopt.design.terms",
+    "Volume": "mpmopt.design.terms",
+    "OnePiece": "mpmopt.design.one_piece",
     "Settings": "mpmopt.optimisation.settings",
     "Stage": "mpmopt.optimisation.settings",
     "optimise": "mpmopt.optimisation.loop",
@@ -30,7 +37,14 @@ _HOMES = {
 if TYPE_CHECKING:
     from mpmopt.app.sweeps import sweep as sweep
     from mpmopt.assess.discretisation import cheapest as cheapest
+    from mpmopt.design.one_piece import OnePiece as OnePiece
     from mpmopt.design.problem import Problem as Problem
+    from mpmopt.design.task import AtMost as AtMost
+    from mpmopt.design.task import Task as Task
+    from mpmopt.design.terms import Displacement as Displacement
+    from mpmopt.design.terms import Effort as Effort
+    from mpmopt.design.terms import Speed as Speed
+    from mpmopt.design.terms import Volume as Volume
     from mpmopt.optimisation.loop import optimise as optimise
     from mpmopt.optimisation.minimize import minimize as minimize
     from mpmopt.optimisation.settings import Settings as Settings

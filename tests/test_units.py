@@ -108,6 +108,8 @@ def test_other_units_lead_to_the_same_steps_bit_for_bit(plain, length, mass, tim
         assert np.array_equal(item.x, there.x)
         assert np.array_equal(item.gamma, there.gamma)
         for name, value in item.numbers().items():
+            if value == ():  # no constraints
+                continue
             if name not in ("seconds", "failure"):
                 found = getattr(there, name)
                 assert np.array_equal(units.get(name, 1.0) * value, found, equal_nan=True), name

@@ -187,11 +187,14 @@ class Field:
     def __post_init__(self) -> None:
         own(self, "phi", "filtered", "gamma", "density", "stiffness")
 
-    def pullback(self, density_bar: NDArray, stiffness_bar: NDArray) -> NDArray:
-        """phi_bar (D,) from the adjoints of density and stiffness, (N,) each."""
+    def pullback(
+        self, density_bar: NDArray, stiffness_bar: NDArray, gamma_bar: NDArray | float = 0.0
+    ) -> NDArray:
+        """phi_bar (D,) from the adjoints of density and stiffness (N,), and of gamma (D,)."""
         chain = self.chain
-        gamma_bar = interpolate_adjoint(chain.solids, density_bar, stiffness_bar)
-        phi_bar = project_adjoint(self.filtered, chain.beta, gamma_bar[chain.designed])
+        through = interpolate_adjoint(chain.solids, density_bar, stiffness_bar)
+        gamma_bar = through[chain.designed] + gamma_bar
+        phi_bar = project_adjoint(self.filtered, chain.beta, gamma_bar)
         return chain.filter.T @ phi_bar
 
 
