@@ -87,20 +87,25 @@ def grid_update_adjoint(grid, window, parameters, velocity_bar, node_bar, a):
         if m > parameters.mass_tolerance:
             per_m = 1.0 / m
             u, v = grid[0, node, 0] * per_m, grid[0, node, 1] * per_m
-            free_u, free_v = free_velocity(grid, node, per_m, parameters)
-            u_bar, v_bar = velocity_bar[0, 2 * node], velocity_bar[0, 2 * node + 1]
-            push = push_bar = 0.0 * m
-            if grid[0, node, 3] > 0.0:
-                push = parameters.dt * grid[0, node, 3] * per_m
+            free_u, free_v = held_u, held_v = free_velocity(grid, node, per_m, parameters)
+            push = parameters.dt * grid[0, node, 3] * per_m
+            if push > 0.0:
                 contact = contact_at(parameters, i0 + a, j0 + b)
-                held = resistance(free_u, free_v, push, contact)
-                u_bar, v_bar = wall_adjoint(i0 + a, j0 + b, *held, parameters, u_bar, v_bar)
+                held_u, held_v = resistance(free_u, free_v, push, contact)
+            u_bar, v_bar = wall_adjoint(
+                i0 + a,
+                j0 + b,
+                held_u,
+                held_v,
+                parameters,
+                velocity_bar[0, 2 * node],
+                velocity_bar[0, 2 * node + 1],
+            )
+            push_bar = 0.0 * m
+            if push > 0.0:
+                contact = contact_at(parameters, i0 + a, j0 + b)
                 u_bar, v_bar, push_bar = resistance_adjoint(
                     free_u, free_v, push, contact, u_bar, v_bar
-                )
-            else:
-                u_bar, v_bar = wall_adjoint(
-                    i0 + a, j0 + b, free_u, free_v, parameters, u_bar, v_bar
                 )
             momentum_bar(node_bar[0], node, u, v, per_m, u_bar, v_bar)
             node_bar[0, node, 2] -= push_bar * push * per_m
