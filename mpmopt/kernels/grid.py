@@ -1,7 +1,7 @@
 """Momentum and mass of nodes to their velocity."""
 
 from mpmopt.kernels.compiler import jit
-from mpmopt.kernels.contact import wall, wall_adjoint
+from mpmopt.kernels.contact import clamp_of, wall, wall_adjoint
 from mpmopt.kernels.layer import contact_at, resistance, resistance_adjoint
 from mpmopt.kernels.simd import add, fused, load, nothing, store
 
@@ -55,8 +55,11 @@ def free_velocity(grid, node, per_m, parameters):
 
 
 @jit
-def grid_update(grid, window, parameters, velocity, a):
-    """Velocity of column a's nodes from momentum, gravity, ground and walls; zero without mass."""
+def grid_update(grid, window, parameters, clamps, velocity, a):
+    """Velocity of column a's nodes from momentum, gravity, ground, walls and a step's clamps.
+
+    It is zero where no mass is.
+    """
     i0, j0, _, nj = window
     for b in range(nj):
         node = a * nj + b
@@ -68,6 +71,9 @@ def grid_update(grid, window, parameters, velocity, a):
                 push = parameters.dt * grid[0, node, 3] / m
                 u, v = resistance(u, v, push, contact_at(parameters, i0 + a, j0 + b))
             u, v = wall(i0 + a, j0 + b, u, v, parameters)
+            clamp = clamp_of(i0 + a, j0 + b, clamps, parameters.dx)
+            if clamp >= 0:
+                u, v = clamps[clamp, 4] + 0.0 * m, clamps[clamp, 5] + 0.0 * m
         velocity[0, 2 * node], velocity[0, 2 * node + 1] = u, v
         if parameters.keep > 0.0:
             u = v = 0.0 * m
@@ -78,7 +84,7 @@ def grid_update(grid, window, parameters, velocity, a):
 
 
 @jit
-def grid_update_adjoint(grid, window, parameters, velocity_bar, node_bar, a):
+def grid_update_adjoint(grid, window, parameters, clamps, velocity_bar, node_bar, a):
     """From velocity_bar of column a's nodes to their momentum_bar, mass_bar and f_N_bar."""
     i0, j0, _, nj = window
     for b in range(nj):
@@ -110,6 +116,8 @@ def grid_update_adjoint(grid, window, parameters, velocity_bar, node_bar, a):
             momentum_bar(node_bar[0], node, u, v, per_m, u_bar, v_bar)
             node_bar[0, node, 2] -= push_bar * push * per_m
             node_bar[0, node, 3] = push_bar * parameters.dt * per_m
+            if clamp_of(i0 + a, j0 + b, clamps, parameters.dx) >= 0:
+                node_bar[0, node] = 0.0
             if parameters.keep > 0.0:
                 per_m = 1.0 / grid[1, node, 2]
                 u, v = grid[1, node, 0] * per_m, grid[1, node, 1] * per_m

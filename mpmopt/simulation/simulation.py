@@ -224,6 +224,10 @@ class Simulation:
         found = kernels.closest(records, reference, solid, self.data, self.parameters)
         return tuple(float(value) for value in found)  # type: ignore[return-value]
 
+    def parameters_of_steps(self, first: int, last: int) -> kernels.Parameters:
+        """The surroundings, in which step `first` is number 0."""
+        return self.parameters._replace(clamps=self.parameters.clamps[first:last])
+
     @property
     def fields(self) -> int:
         """Sheets of nodes: two where particles keep a share of their own velocity, else one."""
@@ -414,7 +418,7 @@ class Forward:
                     start,
                     stop,
                     simulation.data,
-                    simulation.parameters,
+                    simulation.parameters_of_steps(first, last),
                     simulation.signal[first:last],
                     memory.scratch,
                     bar,

@@ -78,7 +78,7 @@ def format_of(values: ArrayLike) -> str:
 
 
 def draw_walls(axes: Axes, scene: Scene, moving: bool = False) -> None:
-    """Draw the walls and the ground, as far as the axes reach now.
+    """Draw the walls, the ground, and clamps with their ways, as far as the axes reach now.
 
     Parameters
     ----------
@@ -105,6 +105,11 @@ def draw_walls(axes: Axes, scene: Scene, moving: bool = False) -> None:
     for ground in scene.ground:
         reach = 4.0 * (right - left + high - low)
         axes.add_patch(Polygon(ground_outline(ground, reach), **SOLID))
+    for clamp in scene.clamps:
+        width, height = np.subtract(clamp.upper, clamp.lower)
+        axes.add_patch(Rectangle(clamp.lower, width, height, fill=False, edgecolor="C1", ls="--"))
+        way = np.array([d for _, d in clamp.path]).reshape(-1, 2)
+        axes.plot(*(way + np.add(clamp.lower, clamp.upper) / 2.0).T, color="C1", lw=0.8)
 
 
 def ground_outline(ground: Ground, reach: float) -> NDArray[np.float64]:
