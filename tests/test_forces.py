@@ -46,7 +46,7 @@ def unexplained(found):
 def legs(**changes):
     """The walker on legs, in which something of everything happens."""
     scene = walker(64, changes.pop("time_step", 8e-4))
-    steps = round(0.2 / scene.time_step)
+    steps = round(0.12 / scene.time_step)
     material = Material(viscosity=0.02)
     problem = Problem(replace(scene, steps=steps, material=material, **changes), 8.0)
     phi = np.where(slanted_legs(problem.particles.position[problem.particles.designed]), 1.0, -1.0)
@@ -96,8 +96,11 @@ def test_the_books_of_a_walker_close_with_the_square_of_the_step():
     assert np.abs(fine.residual).max() <= 0.35 * np.abs(coarse.residual).max()
     for work in ("viscosity", "friction", "damping", "transfer"):
         assert coarse.work[work][-1] < -1e-3 * coarse.turnover
-        assert fine.work[work][-1] == pytest.approx(coarse.work[work][-1], rel=0.3)
-    assert coarse.actuation >= coarse.work["actuation"][-1] > 0.0
+        if work != "transfer":  # which the step itself makes
+            assert fine.work[work][-1] == pytest.approx(coarse.work[work][-1], rel=0.3)
+    assert coarse.actuation > coarse.work["actuation"].max() > coarse.work["actuation"][-1] > 0.0
+    cost = coarse.actuation / (coarse.weight * abs(coarse.travel))
+    assert coarse.cost_of_transport == pytest.approx(cost)
 
 
 def test_forces_are_what_changes_momentum():
@@ -125,7 +128,7 @@ def test_what_slides_on_a_layer_feels_coulombs_force_which_takes_its_motion():
     assert taken == pytest.approx(-along.mean() * found.travel, rel=0.1)
     x, y = found.place[np.isfinite(found.place[:, 0, 0]), 0].T
     assert x[-1] - x[0] == pytest.approx(found.travel, rel=0.2)
-    assert np.all((4 * C < y) & (y < 5 * C))
+    assert np.all((y > 4 * C) & (y < 5 * C))
 
 
 def test_an_affine_motion_without_force_loses_nothing_and_viscosity_takes_what_it_must():
