@@ -161,7 +161,7 @@ def _states(simulation: Simulation) -> Iterator[Array]:
     """States (12, N) after 0, 1, ... steps; of a scene with a mirror (12, 2 N)."""
     mirror = simulation.scene.mirror
     for state in simulation.states():
-        yield state if mirror is None else with_image(state, mirror)
+        yield state.real if mirror is None else with_image(state.real, mirror)
 
 
 class _Account:
@@ -277,7 +277,8 @@ class _Account:
         held = grid[0, :, 3] > 0.0
         impulse = (held * m)[:, None] * (u_ground - u_free)
         resisting = (impulse * self.normal.T).sum(axis=1)[:, None] * self.normal.T
-        stopping = m[:, None] * (u - u_ground)
+        stopping = m[:, None] * (u - u_free) - impulse
+        stopping[np.abs(stopping) <= 1e-13 * m[:, None] * np.abs(u_free).max()] = 0.0  # rounding
         damping = float((resisting * u_mean).sum())
         friction = float(((impulse - resisting) * u_mean).sum())
         walls = float((stopping * u_mean).sum())

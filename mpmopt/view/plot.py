@@ -107,10 +107,10 @@ def plot_forces(path: str | os.PathLike[str], name: str, books: Books) -> None:
     figure.suptitle(f"{name[0].upper()}{name[1:]}, who bears it and who drives it")
     energy, work, force, place = figure.subplots(4, 1, sharex=True)
     for kind, values in books.energy.items():
-        if np.ptp(values) > 0.0:
+        if np.ptp(values) > 1e-9 * books.turnover:
             energy.plot(books.time, values - values[0], lw=1, label=kind)
     for kind, values in books.work.items():
-        if np.ptp(values) > 0.0:
+        if np.ptp(values) > 1e-9 * books.turnover:
             work.plot(books.time, values, lw=1, label=kind)
     work.plot(books.time, books.residual, "k:", lw=1, label="unexplained")
     time, forces, places = books.means()
