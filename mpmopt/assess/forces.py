@@ -201,7 +201,7 @@ class _Account:
     def _motion(self, v: Array, C: Array) -> float:
         """Kinetic energy."""
         inertia = 0.25 * self.scene.grid.dx**2
-        return 0.5 * float(self.mass @ ((v**2).sum(axis=0) + inertia * (C**2).sum(axis=(0, 1))))
+        return 0.5 * float((self.mass * v**2).sum() + inertia * (self.mass * C**2).sum())
 
     def _bearing(self, x: Array) -> tuple[Array, Array]:
         """Normal forces (K, N) of layers on particles, and the unit normals (K, 2, N)."""
@@ -225,14 +225,14 @@ class _Account:
             float((b**2 / share).sum()) * layer.thickness / layer.stiffness
             for b, layer in zip(borne, self.layers)
         )
-        fallen = -float(self.mass @ (x.T @ self.scene.gravity))
-        return self._motion(v, C), float(self.volume @ density), fallen, layer
+        fallen = -float((self.mass * x).sum(axis=1) @ self.scene.gravity)
+        return self._motion(v, C), float((self.volume * density).sum()), fallen, layer
 
     def held(self, state: Array) -> Array:
         """What each actuator squeezes (K,): V/2 S : F^T F."""
         _, F = self._midway(state)
         stretch = np.einsum("kab,cap,cbp->kp", self.stress, F, F)
-        return 0.5 * (self.actuated * stretch) @ self.volume
+        return 0.5 * (self.actuated * stretch * self.volume).sum(axis=1)
 
     def step(self, old: Array, new: Array, signal: Array) -> tuple[tuple[float, ...], Array, Array]:
         """`WORKS` of a step but for the first, and every support's force and place (P, 2)."""
@@ -288,10 +288,10 @@ class _Account:
         C_mean = (4.0 / dx**2) * np.stack([(Nx @ u_mean).T, (Ny @ u_mean).T], axis=1)
         (x_old, F_old), (x_new, F_new) = self._midway(old), self._midway(new)
         strain, moved = _product(F_new - F_old, _inverse(F)), x_new - x_old
-        dissipated = float(self.volume @ (viscous * strain).sum(axis=(0, 1)))
-        kept = 0.5 * float(m @ (u_old**2).sum(axis=1)) - 0.5 * float(m @ (u**2).sum(axis=1))
+        dissipated = float((self.volume * viscous * strain).sum())
+        kept = 0.5 * float((m[:, None] * (u_old**2 - u**2)).sum())
         transfer = kept - self._motion(v, C) + self._motion(v_new, C_new)
-        transfer += float(self.volume @ (tau * (strain - dt * C_mean)).sum(axis=(0, 1)))
+        transfer += float((self.volume * tau * (strain - dt * C_mean)).sum())
         transfer += float((push * (dt * v_mean - moved)).sum())
         works = (-dissipated, friction, damping, walls, transfer)
         return works, *self._supports(x, borne, normal, impulse, stopping)
@@ -331,7 +331,7 @@ class _Account:
 def _mean(places: Array, weights: Array) -> Array:
     """Mean of places (2, N), not a number if weights (N,) are zero."""
     total = weights.sum()
-    return places @ weights / total if total > 0.0 else np.full(2, np.nan)
+    return (places * weights).sum(axis=1) / total if total > 0.0 else np.full(2, np.nan)
 
 
 def _product(a: Array, b: Array) -> Array:
