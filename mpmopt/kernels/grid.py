@@ -1,6 +1,6 @@
 """Momentum and mass of nodes to their velocity."""
 
-from mpmopt.kernels.compiler import jit
+from mpmopt.kernels.compiler import jit, loop_jit
 from mpmopt.kernels.contact import clamp_of, wall, wall_adjoint
 from mpmopt.kernels.layer import contact_at, resistance, resistance_adjoint
 from mpmopt.kernels.simd import add, fused, load, nothing, store
@@ -81,6 +81,13 @@ def grid_update(grid, window, parameters, clamps, velocity, a):
                 per_m = 1.0 / grid[1, node, 2]
                 u, v = grid[1, node, 0] * per_m, grid[1, node, 1] * per_m
             velocity[1, 2 * node], velocity[1, 2 * node + 1] = u, v
+
+
+@loop_jit
+def update_nodes(grid, window, parameters, clamps, velocity):
+    """`grid_update` of all columns."""
+    for a in range(window[2]):
+        grid_update(grid, window, parameters, clamps, velocity, a)
 
 
 @jit

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -185,6 +185,24 @@ class Simulation:
                 step = last
             kept.append(kernels.ungrouped(states[0], *self.initial.shape))
         return kept[-1] if frames is None else np.array(kept)
+
+    def states(self) -> Iterator[NDArray]:
+        """The states (12, N) after 0, 1, ... steps, one after the other.
+
+        Raises
+        ------
+        SimulationError
+            As `run`.
+        """
+        memory = Segment(self, min(WATCH, self.steps), Memory())
+        memory.states[0] = kernels.grouped(self.initial)
+        yield self.initial
+        for first in range(0, self.steps, WATCH):
+            last = min(first + WATCH, self.steps)
+            memory.advance(first, last)
+            for slot in range(1, last - first + 1):
+                yield kernels.ungrouped(memory.states[slot], *self.initial.shape)
+            memory.states[0] = memory.states[last - first]
 
     def watch(self, instants: Collection[int] = ()) -> Watched:
         """Run forward: how the run ends, and how close it came to failure.
