@@ -112,7 +112,9 @@ def postprocess(path: Path, threshold: float) -> int:
     value = post_processed(problem, x, threshold)
     reference = found.summary.get("reference")
     if reference is None:
-        reference = best_actuated(problem.scene, solid_reference, problem.split(x))
+        reference = best_actuated(
+            problem.scene, solid_reference, problem.split(x), task=problem.task
+        )
     share = retained_share(problem.scene, value - reference, optimised - reference)
     shown = "no gain to keep" if np.isnan(share) else f"{share:.1%}"
     sizes = np.bincount(pieces(problem.scene, keep)[keep])
@@ -177,6 +179,7 @@ def cheapest(path: Path, tol: float, gradient_tol: float | None, seconds: float)
             tol,
             beta=problem.chain.beta,
             void_cutoff=problem.void_cutoff,
+            task=problem.task,
             gradient_tolerance=gradient_tol,
             seconds=seconds,
             progress=show,

@@ -13,6 +13,7 @@ from mpmopt.app.summary import summarise
 from mpmopt.assess import refinement, threshold
 from mpmopt.assess.refinement import Variant
 from mpmopt.design.problem import Problem
+from mpmopt.design.task import DEFAULT_TASK
 from mpmopt.errors import SimulationError
 from mpmopt.optimisation import presets
 from mpmopt.optimisation.history import Candidate, Optimisation
@@ -39,8 +40,8 @@ def finished(best_phi=1.0):
     first, best = candidate(0.0, 1.0, objective=0.1), candidate(best_phi, 0.75)
     history = [first, dataclasses.replace(first, failure="torn"), dataclasses.replace(best)]
     return Optimisation(
-        SCENE, SHORT, first.x, best={0: best}, history=history, first=first, last=best,
-        stop_reason="It ended.",
+        SCENE, SHORT, DEFAULT_TASK, first.x, best={0: best}, history=history, first=first,
+        last=best, stop_reason="It ended.",
     )  # fmt: skip
 
 
@@ -51,7 +52,7 @@ def told(monkeypatch):
     rows: list[Variant] = []
     block = [0.3]
 
-    def best_actuated(scene, baseline, *actuations):
+    def best_actuated(scene, baseline, *actuations, task):
         keep = baseline(np.zeros((32, 2)))
         asked.append((int(np.sum(keep)), [float(v.a[0]) for v in actuations]))
         if not np.all(keep):
@@ -134,7 +135,7 @@ def test_a_case_starts_where_it_says(tmp_path, monkeypatch):
 def test_a_baseline_is_kept_for_each_coarsening_of_the_stages(tmp_path, monkeypatch):
     monkeypatch.setattr(case, "_go_on", lambda path, kept, checkpointing: kept.baseline)
     stages = (dataclasses.replace(STAGE, coarsening=2, time_step=4e-3, solid=False), STAGE)
-    twice = [
+    twice: list[dict[str, Any]] = [
         {name: tuple(2 * k for k in getattr(part, name)) for name in ("lower", "upper")}
         for part in SCENE.body
     ]

@@ -12,9 +12,11 @@ from mpmopt.design.actuation import signal
 from mpmopt.design.objective import Objective
 from mpmopt.design.problem import Problem, Variables
 from mpmopt.design.step_control import LIMITS, check_indicators
+from mpmopt.design.task import DEFAULT_TASK, Task
+from mpmopt.design.term import Outcome
 from mpmopt.errors import DesignError, SimulationError
 from mpmopt.scene import Scene
-from mpmopt.scene.particles import discretise
+from mpmopt.scene.particles import discretise, of_solid
 from mpmopt.simulation.simulation import Simulation
 from mpmopt.validation import shown
 
@@ -61,11 +63,10 @@ def solid_body(
     there[particles.designed] = keep
     particles = particles.subset(there)
     ones = np.ones(there.sum())
-    material = scene.material
     simulation = Simulation(
         scene,
         particles,
-        density=material.density * ones,
+        density=of_solid(scene, particles, "density"),
         stiffness=ones,
         signal=signal(scene, variables.a, variables.theta, variables.b),
     )
@@ -76,7 +77,7 @@ def distance(
     scene: Scene,
     keep: NDArray[np.bool_],
     variables: Variables,
-    objective: Callable[[Simulation], Objective] | None = None,
+    task: Task = DEFAULT_TASK,
 ) -> float:
     """Objective L of a `solid_body`.
 
@@ -84,8 +85,8 @@ def distance(
     ----------
     scene, keep, variables
         As in `solid_body`.
-    objective : callable, optional
-        That of a problem (`Problem.objective`), if it is not the scene's.
+    task : Task, optional
+        Whose objective it is.
 
     Raises
     ------
@@ -94,12 +95,10 @@ def distance(
     SimulationError
         If the simulation fails, or goes beyond `SOLID_LIMITS`.
     """
-    simulation, travel = solid_body(scene, keep, variables)
-    if objective is not None:
-        travel = objective(simulation)
-    end = simulation.watch(travel.instants)
+    simulation, _ = solid_body(scene, keep, variables)
+    end = simulation.watch(task.maximise.instants(scene))
     check_indicators(end.indicators, simulation, SOLID_LIMITS)
-    return float(travel.value(end.states))
+    return float(task.maximise.value(Outcome(simulation, np.array(keep, float), end.states)))
 
 
 def kept(problem: Problem, x: NDArray, threshold: float = THRESHOLD) -> NDArray[np.bool_]:
@@ -128,7 +127,7 @@ def post_processed(problem: Problem, x: NDArray, threshold: float = THRESHOLD) -
         As `distance`.
     """
     keep, variables = kept(problem, x, threshold), problem.split(x)
-    return distance(problem.scene, keep, variables, problem.objective)
+    return distance(problem.scene, keep, variables, problem.task)
 
 
 def retained_share(scene: Scene, retained: float, gain: float) -> float:
@@ -146,7 +145,7 @@ def unactuated(problem: Problem, x: NDArray) -> float:
     """Objective L of the post-processed design when no actuator works: how far it merely falls."""
     variables = problem.split(x)
     still = variables._replace(a=0.0 * variables.a, b=0.0 * variables.b)
-    return distance(problem.scene, kept(problem, x), still, problem.objective)
+    return distance(problem.scene, kept(problem, x), still, problem.task)
 
 
 def pieces(scene: Scene, keep: NDArray[np.bool_]) -> NDArray[np.int64]:
@@ -187,7 +186,7 @@ def best_actuated(
     scene: Scene,
     baseline: Baseline,
     *actuations: Variables,
-    objective: Callable[[Simulation], Objective] | None = None,
+    task: Task = DEFAULT_TASK,
 ) -> float:
     """Objective L of the baseline design with the best of some actuations, of those that run.
 
@@ -197,7 +196,7 @@ def best_actuated(
     baseline : callable
         From the design particles' reference positions (D, 2) to which of them are there (D,).
     actuations : Variables
-    objective : callable, optional
+    task : Task, optional
         As in `distance`.
 
     Raises
@@ -210,7 +209,7 @@ def best_actuated(
     values, failure = [], None
     for actuation in actuations:
         try:
-            values.append(distance(scene, keep, actuation, objective))
+            values.append(distance(scene, keep, actuation, task))
         except SimulationError as error:
             failure = error
     if failure is not None and not values:

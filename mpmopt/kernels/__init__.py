@@ -60,7 +60,7 @@ from mpmopt.kernels.contact import wall, wall_adjoint
 from mpmopt.kernels.deformation import deform, deform_adjoint
 from mpmopt.kernels.energy import energy, grips
 from mpmopt.kernels.grid import free_velocity, grid_update, grid_update_adjoint, mirror
-from mpmopt.kernels.indicators import indicators
+from mpmopt.kernels.indicators import SOLID, indicators
 from mpmopt.kernels.layer import press, press_adjoint
 from mpmopt.kernels.material import PARAMETERS, kirchhoff, wave_modulus
 from mpmopt.kernels.overlap import closest
@@ -97,6 +97,7 @@ __all__ = [
     "NODE_SIZE",
     "PARAMETERS",
     "PART_TOO_SMALL",
+    "SOLID",
     "STATE_SIZE",
     "WINDOW_TOO_SMALL",
     "Parameters",

@@ -9,6 +9,7 @@ from typing import Any
 
 from mpmopt.design.problem import Problem
 from mpmopt.design.step_control import LIMITS
+from mpmopt.design.task import DEFAULT_TASK, Task
 from mpmopt.errors import DesignError
 from mpmopt.scene import Scene
 from mpmopt.simulation.checkpoints import Checkpointing
@@ -106,6 +107,7 @@ class Stage:
         scene: Scene,
         time_step: float | None = None,
         checkpointing: Checkpointing | None = None,
+        task: Task = DEFAULT_TASK,
     ) -> Problem:
         """The problem that this stage solves, in another time step if it ended with one."""
         stage = self if time_step is None else dataclasses.replace(self, time_step=time_step)
@@ -116,6 +118,7 @@ class Stage:
             self.void_cutoff,
             self.halvings,
             LIMITS if self.limited else None,
+            task=task,
         )
 
 

@@ -13,8 +13,10 @@ from mpmopt.scene.parts import (
     Wall,
 )
 from mpmopt.scene.scene import Scene
+from mpmopt.scene.silicones import SILICONES
 
 __all__ = [
+    "SILICONES",
     "Actuator",
     "Design",
     "Grid",

@@ -40,8 +40,8 @@ MOST_PARTS = 1000  # of the body, and walls
 class Scene(Checked):
     """One body, what surrounds it, and the way it shall go.
 
-    Units are free but must agree: with metres, seconds and kilograms per square metre, stresses
-    are in newtons per metre.
+    Units are free but must agree: with metres, seconds and kilograms per cubic metre, stresses are
+    in pascals, and forces and energies are those of a metre of depth.
 
     Parameters
     ----------
@@ -55,6 +55,7 @@ class Scene(Checked):
     walls : tuple of Wall, optional
     ground : tuple of Ground, optional
     material : Material, optional
+        Of the regions that have none of their own.
     gravity : (float, float), optional
     direction : (float, float), optional
         Unit vector e of the objective.
@@ -216,7 +217,8 @@ class Scene(Checked):
     def largest_time_step(self) -> float:
         """Stability limit of an isolated particle (`Material.largest_time_step`)."""
         layers = [layer.stiffness / layer.thickness for layer in self.layers]
-        return self.material.largest_time_step(self.grid.dx, max(layers, default=0.0))
+        layer = max(layers, default=0.0)
+        return min(each.largest_time_step(self.grid.dx, layer) for each in self.materials)
 
     @property
     def layers(self) -> tuple[Layer, ...]:
@@ -233,8 +235,22 @@ class Scene(Checked):
 
     @property
     def courant(self) -> float:
-        """Courant number of pressure waves in the solid, c_p dt / dx."""
-        return self.material.wave_speed * self.time_step / self.grid.dx
+        """Courant number of pressure waves in the solid, c_p dt / dx; the fastest count."""
+        return self.wave_speed * self.time_step / self.grid.dx
+
+    @property
+    def wave_speed(self) -> float:
+        """Speed of the fastest pressure waves (`Material.wave_speed`)."""
+        return max(material.wave_speed for material in self.materials)
+
+    @property
+    def materials(self) -> tuple[Material, ...]:
+        """What the body is made of, each once."""
+        return tuple(dict.fromkeys(self.material_of(region) for region in self.body))
+
+    def material_of(self, region: Region) -> Material:
+        """A region's own material, or the scene's."""
+        return self.material if region.material is None else region.material
 
     @property
     def actuators(self) -> tuple[Actuator, ...]:
@@ -289,6 +305,8 @@ class Scene(Checked):
     ) -> Scene:
         """The same scene and duration with another time step, other floors, or wider cells.
 
+        Floors are those of all materials.
+
         Parameters
         ----------
         time_step, void_density, void_stiffness : float, optional
@@ -304,6 +322,12 @@ class Scene(Checked):
         floors = {"void_density": void_density, "void_stiffness": void_stiffness}
         given = {name: value for name, value in floors.items() if value is not None}
         steps, material = self.steps, dataclasses.replace(self.material, **given)
+        body = tuple(
+            region
+            if region.material is None
+            else dataclasses.replace(region, material=dataclasses.replace(region.material, **given))
+            for region in self.body
+        )
         if time_step is None:
             time_step = self.time_step
         else:
@@ -326,7 +350,7 @@ class Scene(Checked):
         nx, ny = (n // coarsening for n in self.grid.cells)
         grid = Grid((nx, ny), self.grid.dx * coarsening)
         return dataclasses.replace(
-            self, grid=grid, time_step=time_step, steps=steps, material=material
+            self, grid=grid, time_step=time_step, steps=steps, body=body, material=material
         )
 
     def to_json(self) -> str:

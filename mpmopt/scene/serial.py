@@ -57,6 +57,8 @@ def parsed(scene_type: type, text: str) -> Any:
             name = item.pop("kind", None)
             if not isinstance(name, str) or name not in kinds:
                 raise SceneError(f"Region: kind = {shown(name)} must be one of {sorted(kinds)}")
+            if item.get("material") is not None:
+                item["material"] = _build(Material, item["material"])
             regions.append(_build(kinds[name], item))
         data["body"] = tuple(regions)
     for name, kind in (("walls", Wall), ("ground", Ground)):

@@ -168,9 +168,10 @@ def _failure(
             f"{height - margin:g})"
         )
     scene = simulation.scene
+    floor = min(material.void_density for material in scene.materials)
     hint = (
         f"take a smaller time step (now {scene.time_step:g}, Courant {scene.courant:.2g}), a "
-        f"higher void density (now {scene.material.void_density:g}), weaker actuation"
+        f"higher void density (now {floor:g}), weaker actuation"
     )
     if end == kernels.ESCAPED:
         hint += ", or a larger grid"

@@ -15,7 +15,7 @@ from numpy.typing import DTypeLike, NDArray
 from mpmopt import kernels
 from mpmopt.errors import DesignError
 from mpmopt.scene import Scene
-from mpmopt.scene.particles import Particles
+from mpmopt.scene.particles import Particles, of_solid
 from mpmopt.simulation.buffers import Memory, Segment
 from mpmopt.simulation.checkpoints import Checkpointing, Checkpoints, Schedule
 from mpmopt.simulation.indicators import WATCH, Indicators, Watched, Watcher
@@ -129,9 +129,9 @@ class Simulation:
         self.parameters = parameters_of(scene)._replace(mass_tolerance=mass_tolerance)
         actuator = kernels.grouped(particles.actuator)
         stress = [(S[0][0], S[0][1], S[1][1]) for S in (a.stress for a in scene.actuators)]
-        solid = [getattr(scene.material, name) for name in kernels.PARAMETERS]
-        constants = np.empty((len(solid), *actuator.shape), real)
-        constants[:] = np.reshape(solid, (-1, 1, 1))
+        constants = np.array([
+            kernels.grouped(of_solid(scene, particles, name)) for name in kernels.PARAMETERS
+        ], dtype=real)  # fmt: skip
         self.data = kernels.ParticleData(
             volume=kernels.grouped(particles.volume.astype(dtype), repeat=False),
             mass=kernels.grouped((particles.volume * density).astype(dtype), repeat=False),
@@ -218,7 +218,7 @@ class Simulation:
 
     def gap(self, records: NDArray) -> tuple[float, float, float]:
         """How near solid that was far apart comes in a state, and where (`kernels.closest`)."""
-        solid = self.data.stiffness.real >= 0.5
+        solid = self.data.stiffness.real >= kernels.SOLID
         solid &= self.data.mass.real > 0.0  # others only fill their group
         reference = kernels.grouped(self.particles.position.T)
         found = kernels.closest(records, reference, solid, self.data, self.parameters)
