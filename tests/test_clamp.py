@@ -11,9 +11,12 @@ from exact import at_rest, solid_simulation
 from mpmopt.assess.verify import DOT_TOLERANCE, complex_step_test, kernel_mismatches
 from mpmopt.design.problem import Problem
 from mpmopt.errors import SceneError
+from mpmopt.kernels import plain
+from mpmopt.kernels.contact import clamp_of
 from mpmopt.scene import Actuator, Clamp, Design, Grid, Ground, Mirror, Scene, Solid
 from mpmopt.scene.particles import discretise
 from mpmopt.simulation.reference import step
+from mpmopt.simulation.surroundings import parameters_of
 
 C = 1 / 16
 PATH = ((0.02, (0.0, 0.0)), (0.06, (0.02, 0.0)), (0.09, (0.02, -0.01)))
@@ -108,6 +111,13 @@ def test_a_clamp_holds_what_stands_on_ground_and_comes_first():
     # Their nodes reach no farther up than the clamp.
     low = (start[0] < 3.5 * C) & (start[1] < 3.5 * C + 0.5 * C)
     assert np.abs(end[:2, low] - start[:2, low]).max(initial=0.0) <= 1e-14
+
+
+def test_nodes_inside_a_clamp_and_on_its_edges_are_held():
+    (row,) = parameters_of(finger(Clamp((2 * C, 3 * C), (4 * C, 6 * C)))).clamps[:1]
+    held = np.array([[plain(clamp_of)(i, j, row, C) == 0 for j in range(17)] for i in range(25)])
+    i, j = np.indices(held.shape)
+    assert np.array_equal(held, (i >= 2) & (i <= 4) & (j >= 3) & (j <= 6))
 
 
 def test_a_scene_with_clamps_is_the_same_from_json_and_says_so():
