@@ -10,6 +10,7 @@ from silicone import silicone_walker, slanted_legs
 
 from mpmopt.assess.threshold import solid_body
 from mpmopt.assess.verify import DOT_TOLERANCE, complex_step_test, kernel_mismatches
+from mpmopt.design.objective import Objective
 from mpmopt.design.problem import Problem, Variables
 from mpmopt.errors import SceneError
 from mpmopt.kernels import PARAMETERS, ungrouped
@@ -86,7 +87,7 @@ def test_each_particle_is_of_its_regions_material(rng):
         ):
             expected = solid * ((1.0 - floor) * gamma + floor)
             assert values[own] == pytest.approx(expected * np.ones(own.sum()), rel=1e-14)
-    binary, _ = solid_body(scene, np.ones(32, bool), Variables(np.zeros(32), *np.zeros((3, 2))))
+    binary = solid_body(scene, np.ones(32, bool), Variables(np.zeros(32), *np.zeros((3, 2))))
     mass = [scene.material_of(region).density for region in scene.body]
     expected = particles.volume * np.array(mass)[particles.region]
     assert ungrouped(binary.data.mass, 1, len(expected))[0] == pytest.approx(expected, rel=1e-14)
@@ -166,11 +167,10 @@ def test_a_silicone_robot_moves_in_metres_and_seconds():
     assert 0.5 < scene.time_step / scene.largest_time_step < 1.0
     particles = discretise(scene)
     keep = slanted_legs(particles.position[particles.designed])
-    body, objective = solid_body(
-        scene, keep, Variables(np.zeros(0), *np.array([[1.0], [-0.3], [-0.5]]))
-    )
+    body = solid_body(scene, keep, Variables(np.zeros(0), *np.array([[1.0], [-0.3], [-0.5]])))
     mass = float(body.data.mass.sum())  # kg per metre of depth
     assert 0.6 < mass < 0.9
+    objective = Objective.of(body.scene, body.particles)
     run = body.watch(objective.instants)
     assert run.indicators.courant < 1.0
     assert run.indicators.stretch < 2.0
