@@ -36,15 +36,12 @@ def design(problem: Problem) -> Array:
     return problem.join(np.where(slanted_legs(positions), 0.6, -0.4) + noise, 0.9, -0.3, -0.5)
 
 
-def radius(
-    problem: Problem, x: Array, value: float, gradient: Array, direction: Array | None = None
-) -> float:
+def radius(problem: Problem, x: Array, value: float, gradient: Array) -> float:
     """Largest change of all design variables up to which the gradient predicts L within 1 %.
 
-    Along a direction, or a random one, whose entries are -1 or 1; 0 if it never does.
+    Along a random direction whose entries are -1 or 1; 0 if it never does.
     """
-    if direction is None:
-        direction = np.random.default_rng(1).choice([-1.0, 1.0], x.size)
+    direction = np.random.default_rng(1).choice([-1.0, 1.0], x.size)
     slope = gradient @ direction
     good = 0.0
     for step in STEPS[::-1]:
