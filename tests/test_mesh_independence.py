@@ -1,0 +1,53 @@
+"""The smallest version of the command that asks whether the grid matters."""
+
+import csv
+from dataclasses import replace
+
+import mesh_independence
+import numpy as np
+import pytest
+from mesh_independence import CHOICES, displacement, legs
+
+from mpmopt.scene.particles import discretise
+
+LAYER, CLAMPED = CHOICES[:2]
+
+
+def test_the_body_is_the_same_on_all_cells():
+    positions = [discretise(LAYER.scene(n)) for n in (64, 128)]
+    coarse, fine = (p.position[p.designed][legs(p.position[p.designed])] for p in positions)
+    assert len(fine) == 4 * len(coarse)
+    quarters = {tuple(q) for q in np.floor(fine * 128).astype(int)}
+    assert quarters == {tuple(q) for q in np.floor(coarse * 128).astype(int)}
+
+
+def test_the_choices_are_scenes_that_differ_in_what_they_say():
+    for choice in CHOICES:
+        for cells in mesh_independence.CELLS:
+            scene = choice.scene(cells)
+            assert scene.steps * scene.time_step == pytest.approx(mesh_independence.SECONDS)
+            assert bool(scene.ground) is choice.layer is not bool(scene.walls)
+
+
+def test_a_step_of_half_the_length_moves_the_walker_as_far_with_a_blend():
+    plain, blended = (
+        [displacement(replace(LAYER, blend_time=tau), 64, k)["displacement"] for k in (0, 1)]
+        for tau in (0.0, 2e-3)
+    )
+    assert blended[1] == pytest.approx(blended[0], rel=0.015)
+    assert abs(plain[1] - plain[0]) > abs(blended[1] - blended[0])
+    assert plain[0] == pytest.approx(0.0934, abs=0.002)
+
+
+def test_the_command_writes_its_tables_and_its_figure(tmp_path):
+    assert mesh_independence.main(["--quick", "--out", str(tmp_path)]) == 0
+    with (tmp_path / "mesh_independence.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["choice"] for row in rows] == ["layer", "clamped nodes"]
+    assert all(0.0 <= float(row["spread over steps, 64 cells"]) < 0.5 for row in rows)
+    with (tmp_path / "mesh_independence_validity.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    for row in rows:
+        for direction in ("random signs", "the gradient's signs"):
+            assert 0.0 < float(row[f"1%, {direction}"]) <= float(row[f"5%, {direction}"])
+    assert (tmp_path / "mesh_independence.png").stat().st_size > 0
