@@ -1,0 +1,360 @@
+"""Total Lagrangian steps: a body on the lattice of its own reference configuration.
+
+Nodes are control points of quadratic B-splines, of which the cells are the spans; particles are
+quadrature points at fixed places in their cells. Fields on nodes are polynomials of cells
+(`kernels.spline`), so all that depends on a particle's place are the constants of a `pattern`.
+"""
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from mpmopt.kernels.arrays import COEFFICIENTS, clear
+from mpmopt.kernels.compiler import jit, loop_jit
+from mpmopt.kernels.simd import (
+    above,
+    add,
+    chosen,
+    load,
+    logarithm,
+    number,
+    pack,
+    reciprocal,
+    total,
+)
+from mpmopt.kernels.spline import taylor, taylor_adjoint
+
+# Below this J the logarithm goes on as its Taylor polynomial of order two, so that void may invert.
+LEAST_J = 0.25
+# Orders (along x, along y) of a cell's polynomial, as their records follow each other; those of the
+# derivative along x, and along y.
+ALONG_X = (3, 6, 4, 7, 5, 8)  # (1, 0), (2, 0), (1, 1), (2, 1), (1, 2), (2, 2)
+ALONG_Y = (1, 2, 4, 5, 7, 8)  # (0, 1), (0, 2), (1, 1), (1, 2), (2, 1), (2, 2)
+
+
+class Lattice(NamedTuple):
+    """A body on its reference lattice of A by B cells, R groups of four particles in each."""
+
+    dt: float
+    dx: float
+    gravity_x: float
+    gravity_y: float
+    columns: int  # A
+    rows: int  # B
+    volume: float  # of a particle
+    lame_lambda: float  # of the solid, like the others
+    lame_mu: float
+    viscosity: float
+    pattern: NDArray[np.float64]  # (R, 12, 4): of the derivatives along x and y, per dx
+    stiffness: NDArray  # (A B R, 4) share of the solid's, zero where no particle is
+    filled: NDArray[np.bool_]  # (A B,) whether a cell has particles
+    actuated: NDArray[np.float64]  # (K, A B R, 4) 1 for the particles of actuator k, else 0
+    active: NDArray[np.bool_]  # (A B R,) whether a group has actuated particles
+    actuation_stress: NDArray[np.float64]  # (K, 3) second Piola-Kirchhoff S: xx, xy, yy
+    mass: NDArray  # (M,) of the nodes, lumped
+
+
+class LatticeBar(NamedTuple):
+    """Adjoints of `Lattice`, accumulated over the steps, and of the signal."""
+
+    stiffness: NDArray  # (A B R, 4)
+    mass: NDArray  # (M,)
+
+    @classmethod
+    def zeros(cls, lattice: Lattice, dtype: DTypeLike = float) -> "LatticeBar":
+        """Nothing accumulated yet."""
+        return cls(np.zeros(lattice.stiffness.shape, dtype), np.zeros(lattice.mass.shape, dtype))
+
+
+@jit
+def slopes_x(cells, c, lane, pattern, r):
+    """Derivative along x of a field, one lane of the cell's records, at four particles."""
+    return (
+        load(pattern, 12 * r) * number(cells, c + 3, lane)
+        + load(pattern, 12 * r + 1) * number(cells, c + 6, lane)
+        + load(pattern, 12 * r + 2) * number(cells, c + 4, lane)
+        + load(pattern, 12 * r + 3) * number(cells, c + 7, lane)
+        + load(pattern, 12 * r + 4) * number(cells, c + 5, lane)
+        + load(pattern, 12 * r + 5) * number(cells, c + 8, lane)
+    )
+
+
+@jit
+def slopes_y(cells, c, lane, pattern, r):
+    """Derivative along y of a field, one lane of the cell's records, at four particles."""
+    return (
+        load(pattern, 12 * r + 6) * number(cells, c + 1, lane)
+        + load(pattern, 12 * r + 7) * number(cells, c + 2, lane)
+        + load(pattern, 12 * r + 8) * number(cells, c + 4, lane)
+        + load(pattern, 12 * r + 9) * number(cells, c + 5, lane)
+        + load(pattern, 12 * r + 10) * number(cells, c + 7, lane)
+        + load(pattern, 12 * r + 11) * number(cells, c + 8, lane)
+    )
+
+
+@jit
+def gradients(cells, c, first, pattern, r):
+    """Gradient (00, 01, 10, 11) of the vector field in lanes `first` and `first` + 1."""
+    return (
+        slopes_x(cells, c, first, pattern, r),
+        slopes_y(cells, c, first, pattern, r),
+        slopes_x(cells, c, first + 1, pattern, r),
+        slopes_y(cells, c, first + 1, pattern, r),
+    )
+
+
+@jit
+def gradients_adjoint(moments, c, pattern, r, P, Q):
+    """Adds to a cell's moments what `gradients` transposed gives of P in lanes 0, 1, Q in 2, 3."""
+    p00, p01, p10, p11 = P
+    q00, q01, q10, q11 = Q
+    for k in range(6):
+        w = load(pattern, 12 * r + k)
+        order = (k % 2 + 1) * 3 + k // 2
+        add(moments, c + order, pack(total(w * p00), total(w * p10), total(w * q00), total(w * q10)))
+    for k in range(6):
+        w = load(pattern, 12 * r + 6 + k)
+        order = (k // 2) * 3 + k % 2 + 1
+        add(moments, c + order, pack(total(w * p01), total(w * p11), total(w * q01), total(w * q11)))
+
+
+@jit
+def continued(J):
+    """ln J and its first and second derivative, continued below `LEAST_J`."""
+    inside = above(J, LEAST_J)
+    safe = chosen(inside, J, 0.0 * J + LEAST_J)
+    slope = reciprocal(safe)
+    off = J - safe  # zero inside
+    log = logarithm(safe)
+    bend = slope * slope
+    return log + off * slope - 0.5 * off * off * bend, slope - off * bend, 0.0 * J - bend
+
+
+@jit
+def second_piola(lattice, g, signal):
+    """s S of the actuators of four particles: xx, xy, yy."""
+    s00 = s01 = s11 = 0.0 * load(lattice.stiffness, g)
+    for k in range(signal.size):
+        there = load(lattice.actuated[k], g)
+        s00 = s00 + signal[k] * lattice.actuation_stress[k, 0] * there
+        s01 = s01 + signal[k] * lattice.actuation_stress[k, 1] * there
+        s11 = s11 + signal[k] * lattice.actuation_stress[k, 2] * there
+    return s00, s01, s11
+
+
+@jit
+def solid_stress(F, rate, lattice):
+    """First Piola-Kirchhoff stress P of the solid at F and its rate of change (00, 01, 10, 11).
+
+    P = mu F + (lambda ln J - mu) (ln J)' cof F + eta F sym(F^T dF/dt).
+    """
+    f00, f01, f10, f11 = F
+    d00, d01, d10, d11 = rate
+    log_J, slope, _ = continued(f00 * f11 - f01 * f10)
+    mu = lattice.lame_mu
+    h = (lattice.lame_lambda * log_J - mu) * slope
+    p00, p01 = mu * f00 + h * f11, mu * f01 - h * f10
+    p10, p11 = mu * f10 - h * f01, mu * f11 + h * f00
+    if lattice.viscosity > 0.0:
+        eta = lattice.viscosity
+        e00, e11 = eta * (f00 * d00 + f10 * d10), eta * (f01 * d01 + f11 * d11)
+        e01 = 0.5 * eta * (f00 * d01 + f10 * d11 + f01 * d00 + f11 * d10)
+        p00, p01 = p00 + f00 * e00 + f01 * e01, p01 + f00 * e01 + f01 * e11
+        p10, p11 = p10 + f10 * e00 + f11 * e01, p11 + f10 * e01 + f11 * e11
+    return p00, p01, p10, p11
+
+
+@jit
+def solid_stress_adjoint(F, rate, lattice, P_bar):
+    """F_bar and the adjoint of the rate from P_bar: the transpose of `solid_stress`."""
+    f00, f01, f10, f11 = F
+    d00, d01, d10, d11 = rate
+    q00, q01, q10, q11 = P_bar
+    log_J, slope, bend = continued(f00 * f11 - f01 * f10)
+    mu, lam = lattice.lame_mu, lattice.lame_lambda
+    free = lam * log_J - mu
+    h = free * slope
+    h_bar = q00 * f11 - q01 * f10 - q10 * f01 + q11 * f00
+    J_bar = h_bar * (lam * slope * slope + free * bend)
+    b00, b01 = mu * q00 + h * q11 + J_bar * f11, mu * q01 - h * q10 - J_bar * f10
+    b10, b11 = mu * q10 - h * q01 - J_bar * f01, mu * q11 + h * q00 + J_bar * f00
+    r00 = r01 = r10 = r11 = 0.0 * q00
+    if lattice.viscosity > 0.0:
+        eta = lattice.viscosity
+        e00, e11 = eta * (f00 * d00 + f10 * d10), eta * (f01 * d01 + f11 * d11)
+        e01 = 0.5 * eta * (f00 * d01 + f10 * d11 + f01 * d00 + f11 * d10)
+        b00, b01 = b00 + q00 * e00 + q01 * e01, b01 + q00 * e01 + q01 * e11
+        b10, b11 = b10 + q10 * e00 + q11 * e01, b11 + q10 * e01 + q11 * e11
+        # M = eta sym(F^T P_bar)
+        m00, m11 = eta * (f00 * q00 + f10 * q10), eta * (f01 * q01 + f11 * q11)
+        m01 = 0.5 * eta * (f00 * q01 + f10 * q11 + f01 * q00 + f11 * q10)
+        b00, b01 = b00 + d00 * m00 + d01 * m01, b01 + d00 * m01 + d01 * m11
+        b10, b11 = b10 + d10 * m00 + d11 * m01, b11 + d10 * m01 + d11 * m11
+        r00, r01 = f00 * m00 + f01 * m01, f00 * m01 + f01 * m11
+        r10, r11 = f10 * m00 + f11 * m01, f10 * m01 + f11 * m11
+    return (b00, b01, b10, b11), (r00, r01, r10, r11)
+
+
+@jit
+def forces(cells, moments, lattice, signal):
+    """Moments of the internal force - sum V P G of all cells, from the polynomials of (x, v)."""
+    groups, pattern = lattice.pattern.shape[0] // 12, lattice.pattern
+    for cell in range(lattice.columns * lattice.rows):
+        if lattice.filled[cell]:
+            c = COEFFICIENTS * cell
+            for r in range(groups):
+                g = cell * groups + r
+                F = gradients(cells, c, 0, pattern, r)
+                rate = gradients(cells, c, 2, pattern, r)
+                p00, p01, p10, p11 = solid_stress(F, rate, lattice)
+                share = -lattice.volume * load(lattice.stiffness, g)
+                p00, p01, p10, p11 = share * p00, share * p01, share * p10, share * p11
+                if lattice.active[g]:
+                    f00, f01, f10, f11 = F
+                    s00, s01, s11 = second_piola(lattice, g, signal)
+                    V = lattice.volume
+                    p00, p01 = p00 - V * (f00 * s00 + f01 * s01), p01 - V * (f00 * s01 + f01 * s11)
+                    p10, p11 = p10 - V * (f10 * s00 + f11 * s01), p11 - V * (f10 * s01 + f11 * s11)
+                nothing = 0.0 * p00
+                none = nothing, nothing, nothing, nothing
+                gradients_adjoint(moments, c, pattern, r, (p00, p01, p10, p11), none)
+
+
+@jit
+def forces_adjoint(cells, cells_bar, moments, lattice, signal, bar, signal_bar):
+    """From f_bar, of which `cells_bar` are the polynomials, to moments of x_bar and v_bar.
+
+    Adds to the adjoints of stiffness and signal.
+    """
+    groups, pattern = lattice.pattern.shape[0] // 12, lattice.pattern
+    V = lattice.volume
+    for cell in range(lattice.columns * lattice.rows):
+        if lattice.filled[cell]:
+            c = COEFFICIENTS * cell
+            for r in range(groups):
+                g = cell * groups + r
+                F = gradients(cells, c, 0, pattern, r)
+                rate = gradients(cells, c, 2, pattern, r)
+                q00, q01, q10, q11 = gradients(cells_bar, c, 0, pattern, r)
+                q00, q01, q10, q11 = -V * q00, -V * q01, -V * q10, -V * q11
+                p00, p01, p10, p11 = solid_stress(F, rate, lattice)
+                add(bar.stiffness, g, q00 * p00 + q01 * p01 + q10 * p10 + q11 * p11)
+                k = load(lattice.stiffness, g)
+                P_bar = k * q00, k * q01, k * q10, k * q11
+                F_bar, rate_bar = solid_stress_adjoint(F, rate, lattice, P_bar)
+                if lattice.active[g]:
+                    f00, f01, f10, f11 = F
+                    b00, b01, b10, b11 = F_bar
+                    s00, s01, s11 = second_piola(lattice, g, signal)
+                    b00, b01 = b00 + q00 * s00 + q01 * s01, b01 + q00 * s01 + q01 * s11
+                    b10, b11 = b10 + q10 * s00 + q11 * s01, b11 + q10 * s01 + q11 * s11
+                    F_bar = b00, b01, b10, b11
+                    m00, m11 = f00 * q00 + f10 * q10, f01 * q01 + f11 * q11
+                    m01 = f00 * q01 + f10 * q11 + f01 * q00 + f11 * q10
+                    for a in range(signal.size):
+                        power = (
+                            lattice.actuation_stress[a, 0] * m00
+                            + lattice.actuation_stress[a, 1] * m01
+                            + lattice.actuation_stress[a, 2] * m11
+                        )
+                        signal_bar[a] += total(load(lattice.actuated[a], g) * power)
+                gradients_adjoint(moments, c, pattern, r, F_bar, rate_bar)
+
+
+@loop_jit
+def advance_lattice(
+    states: NDArray, first: int, last: int, lattice: Any, signal: NDArray
+) -> tuple[int, int]:
+    """Steps `first` to `last` of a lattice: slot n of `states` (., M, 4) to slot n + 1, round.
+
+    A node's record is (x_x, x_y, v_x, v_y). Returns the step reached and the node that is not a
+    number, or -1.
+    """
+    nodes = len(lattice.mass)
+    window = (0, 0, lattice.columns + 2, lattice.rows + 2)
+    records = COEFFICIENTS * window[2] * window[3]
+    cells, moments = np.zeros((records, 4), states.dtype), np.zeros((records, 4), states.dtype)
+    force = np.zeros((nodes, 4), states.dtype)
+    dt = lattice.dt
+    for n in range(first, last):
+        old, new = states[n % len(states)], states[(n + 1) % len(states)]
+        taylor(old, window, window, cells)
+        clear(moments, window)
+        forces(cells, moments, lattice, signal[n])
+        taylor_adjoint(moments, window, force)
+        for i in range(nodes):
+            u = v = 0.0 * old[i, 2]
+            if lattice.mass[i].real > 0.0:
+                per_m = dt / lattice.mass[i]
+                u = old[i, 2] + per_m * force[i, 0] + dt * lattice.gravity_x
+                v = old[i, 3] + per_m * force[i, 1] + dt * lattice.gravity_y
+            new[i, 2], new[i, 3] = u, v
+            new[i, 0], new[i, 1] = old[i, 0] + dt * u, old[i, 1] + dt * v
+            if not (math.isfinite(u.real) and math.isfinite(v.real)):
+                return n, i
+    return last, -1
+
+
+@loop_jit
+def advance_lattice_adjoint(
+    states: NDArray,
+    first: int,
+    last: int,
+    lattice: Any,
+    signal: NDArray,
+    state_bar: NDArray,
+    bar: Any,
+    signal_bar: NDArray,
+) -> None:
+    """The adjoint of `advance_lattice`, from step `last` back to `first`.
+
+    `state_bar` (M, 4) is overwritten; `bar` and `signal_bar` (steps, K) are added to.
+    """
+    nodes = len(lattice.mass)
+    window = (0, 0, lattice.columns + 2, lattice.rows + 2)
+    records = COEFFICIENTS * window[2] * window[3]
+    cells, cells_bar = np.zeros((records, 4), states.dtype), np.zeros((records, 4), states.dtype)
+    moments = np.zeros((records, 4), states.dtype)
+    force_bar, back = np.zeros((nodes, 4), states.dtype), np.zeros((nodes, 4), states.dtype)
+    dt = lattice.dt
+    for n in range(last - 1, first - 1, -1):
+        old, new = states[n], states[n + 1]
+        for i in range(nodes):
+            force_bar[i] = 0.0
+            if lattice.mass[i] > 0.0:
+                u_bar = state_bar[i, 2] + dt * state_bar[i, 0]
+                v_bar = state_bar[i, 3] + dt * state_bar[i, 1]
+                per_m = dt / lattice.mass[i]
+                force_bar[i, 0], force_bar[i, 1] = per_m * u_bar, per_m * v_bar
+                # dt f / m = v' - v - dt g
+                pushed_x = new[i, 2] - old[i, 2] - dt * lattice.gravity_x
+                pushed_y = new[i, 3] - old[i, 3] - dt * lattice.gravity_y
+                bar.mass[i] -= (pushed_x * u_bar + pushed_y * v_bar) / lattice.mass[i]
+                state_bar[i, 2], state_bar[i, 3] = u_bar, v_bar
+            else:
+                state_bar[i, 2] = state_bar[i, 3] = 0.0
+        taylor(old, window, window, cells)
+        taylor(force_bar, window, window, cells_bar)
+        clear(moments, window)
+        forces_adjoint(cells, cells_bar, moments, lattice, signal[n], bar, signal_bar[n])
+        taylor_adjoint(moments, window, back)
+        for i in range(nodes):
+            add(state_bar, i, load(back, i))
+
+
+def pattern(per_cell: int, dx: float) -> NDArray[np.float64]:
+    """Constants (12 R, 4) of the n x n particles of a cell, for `slopes_x` and `slopes_y`.
+
+    Particle a n + b is a-th along x and b-th along y; what fills the last group is at the middle.
+    """
+    t = (np.arange(per_cell) + 0.5) / per_cell - 0.5
+    x, y = (each.ravel() for each in np.meshgrid(t, t, indexing="ij"))
+    groups = -(-x.size // 4)
+    x, y = (np.concatenate([each, np.zeros(4 * groups - each.size)]) for each in (x, y))
+    one = np.ones_like(x)
+    along_x = one, x, y, x * y, y * y / 2, x * y * y / 2
+    along_y = one, y, x, x * y, x * x / 2, x * x * y / 2
+    constants = np.stack([*along_x, *along_y]) / dx
+    return constants.reshape(12, groups, 4).swapaxes(0, 1).reshape(-1, 4).copy()
