@@ -67,8 +67,7 @@ def moving(scene: Scene, particles: Particles, velocity: np.ndarray, slope: np.n
     state[[8, 11]] = 1.0
     ones = np.ones(count)
     return Simulation(
-        scene, particles, material.density * ones, material.lame_lambda * ones,
-        material.lame_mu * ones, np.zeros((scene.steps, 0)), state,
+        scene, particles, material.density * ones, ones, np.zeros((scene.steps, 0)), state
     )  # fmt: skip
 
 

@@ -19,8 +19,7 @@ def solid_simulation(scene, particles=None, state=None, precision="double"):
     material = scene.material
     signal = np.zeros((scene.steps, len(scene.actuators)))
     return Simulation(
-        scene, particles, material.density * ones, material.lame_lambda * ones,
-        material.lame_mu * ones, signal, state, precision,
+        scene, particles, material.density * ones, ones, signal, state, precision
     )  # fmt: skip
 
 
@@ -97,7 +96,7 @@ class Bar:
             forward = simulation.forward(store)
             value = float(self.objective.value(forward.states))
             bar = forward.reverse(self.objective.terminal_adjoints(forward.states))
-        by_mu = simulation.scene.material.lame_mu * bar.lame_mu.sum()
+        by_mu = bar.stiffness.sum()  # lambda is zero
         strain = simulation.scene.time_step * state[4]
         by_v0 = bar.state[[2, 4, 8]] * [state[2], state[4], -strain / (1.0 + strain) ** 2]
         return value - self.middle, np.array([by_mu, by_v0.sum()])

@@ -50,7 +50,6 @@ SMALL = case.Case(
             Stage(2.0, 1e-2, 1e-3, 8e-4),
             Stage(8.0, 1e-2, 1e-3, 8e-4, solid=True, void_cutoff=0.05),
         ),
-        scouting=1,
         window=2,
         least_iterations=6,
         most_iterations=6,

@@ -352,13 +352,13 @@ def _dataset(name: str, **options: Any) -> Callable[[h5py.File], None]:
 def _virtual(file: h5py.File) -> None:
     layout = h5py.VirtualLayout(shape=(35,), dtype="f8")
     layout[:] = h5py.VirtualSource("elsewhere.h5", "x", shape=(35,))
-    file.pop("legs/0/stages/0/x")
-    file.create_virtual_dataset("legs/0/stages/0/x", layout)
+    file.pop("stages/0/x")
+    file.create_virtual_dataset("stages/0/x", layout)
 
 
 def _cycle(file: h5py.File) -> None:
     for k in range(50):
-        file[f"legs/0/stages/0/back{k}"] = file["legs"]
+        file[f"stages/0/back{k}"] = file["stages"]
 
 
 def _deep(file: h5py.File) -> None:
@@ -390,48 +390,48 @@ CHANGES: list[Callable[[h5py.File], Any]] = [
     lambda f: f["best"].attrs.update(stage=99),
     lambda f: f["best"].attrs.update(stage=np.inf),
     lambda f: f["best"].attrs.update(stage="x"),
-    lambda f: f["legs/0/stages/0"].attrs.update(time_step=np.nan),
-    lambda f: f["legs/0/stages/0"].attrs.update(time_step=1e-300),
-    lambda f: f["legs/0/stages/0"].attrs.update(time_step=1e3),
-    _link("legs/0/stages/0/x", h5py.ExternalLink("other.h5", "/x")),
-    _link("legs/0/stages/0", h5py.ExternalLink("/etc/passwd", "/")),
+    lambda f: f["stages/0"].attrs.update(time_step=np.nan),
+    lambda f: f["stages/0"].attrs.update(time_step=1e-300),
+    lambda f: f["stages/0"].attrs.update(time_step=1e3),
+    _link("stages/0/x", h5py.ExternalLink("other.h5", "/x")),
+    _link("stages/0", h5py.ExternalLink("/etc/passwd", "/")),
     _link("history", h5py.SoftLink("/history")),
     _link("history/beta", h5py.SoftLink("/stages/0/x")),
-    _dataset("legs/0/stages/0/x", data=OBJECTS),
-    _dataset("legs/0/stages/0/x", shape=(BIG,), dtype="f8", chunks=(1024,)),
-    _dataset("legs/0/stages/0/x", shape=(BIG,), dtype="f8"),
+    _dataset("stages/0/x", data=OBJECTS),
+    _dataset("stages/0/x", shape=(BIG,), dtype="f8", chunks=(1024,)),
+    _dataset("stages/0/x", shape=(BIG,), dtype="f8"),
     _dataset("history/beta", shape=(BIG,), dtype="f8", chunks=(1024,), compression="gzip"),
     _dataset("history/failure", shape=(BIG,), dtype=h5py.string_dtype(), chunks=(1024,)),
     _dataset("history/failure", data=np.arange(3.0)),
     _dataset("history/failure", shape=(3,), dtype=h5py.ref_dtype),
     _dataset("history/failure", shape=(3,), dtype=h5py.vlen_dtype(np.float64)),
-    _dataset("legs/0/stages/0/x", shape=(35,), dtype="f8", external=[("/etc/passwd", 0, 280)]),
-    _dataset("legs/0/stages/0/x", data=np.full(35, np.nan)),
-    _dataset("legs/0/stages/0/x", data=np.zeros(34)),
-    _dataset("legs/0/stages/0/x", data=np.zeros(35, np.complex128)),
-    _dataset("legs/0/stages/0/x", data=np.zeros(35, [("a", "f8")])),
-    _dataset("legs/0/stages/0/x", data=np.zeros((35, 1))),
-    _dataset("legs/0/stages/0/x", data=3.0),
-    _dataset("legs/0/stages/0/x", dtype=np.float64),
+    _dataset("stages/0/x", shape=(35,), dtype="f8", external=[("/etc/passwd", 0, 280)]),
+    _dataset("stages/0/x", data=np.full(35, np.nan)),
+    _dataset("stages/0/x", data=np.zeros(34)),
+    _dataset("stages/0/x", data=np.zeros(35, np.complex128)),
+    _dataset("stages/0/x", data=np.zeros(35, [("a", "f8")])),
+    _dataset("stages/0/x", data=np.zeros((35, 1))),
+    _dataset("stages/0/x", data=3.0),
+    _dataset("stages/0/x", dtype=np.float64),
     _virtual,
     _cycle,
     _deep,
-    lambda f: f.create_group("legs/0/stages/9"),
-    lambda f: f.create_group("legs/0/stages/-1"),
-    lambda f: f.create_group("legs/0/stages/" + "9" * 5000),
+    lambda f: f.create_group("stages/9"),
+    lambda f: f.create_group("stages/-1"),
+    lambda f: f.create_group("stages/" + "9" * 5000),
     lambda f: f.pop("best"),
-    lambda f: f.pop("legs/0"),
-    lambda f: f.attrs.update(leg=7),
-    lambda f: f.attrs.update(leg=-1),
-    lambda f: f["legs/0"].attrs.update(start=np.nan),
+    lambda f: f.pop("x"),
+    lambda f: f.attrs.update(stage=7),
+    lambda f: f.attrs.update(stage=-1),
+    lambda f: f.attrs.update(stage=np.nan),
     lambda f: f["last"].attrs.update(stage=2**62),
     lambda f: f["last"].attrs.update(objective="far"),
     lambda f: f["first"].attrs.pop("beta"),
     lambda f: f["stage/mma"].pop("lower"),
     _dataset("stage/mma/x_previous", data=np.full(3, np.nan)),
     _dataset("stage/values", data=np.zeros(0)),
-    lambda f: f.create_dataset("drawing/1", data=np.zeros(3)),
-    lambda f: f.create_dataset("drawing/x", data=np.zeros(3, bool)),
+    lambda f: f.create_dataset("baseline/1", data=np.zeros(3)),
+    lambda f: f.create_dataset("baseline/x", data=np.zeros(3, bool)),
 ]
 
 

@@ -38,7 +38,7 @@ PRINTED = {
 def row(name: str, source: str, summary: Mapping[str, Any]) -> dict[str, str]:
     """One line of the table, from a summary or from what the paper printed."""
     values = dict(summary)
-    references = [summary["reference"], summary.get("reference_drawn")]
+    references = [summary["reference"], summary.get("baseline")]
     values["reference"] = max(value for value in references if value is not None)
     optimised, solid = values["optimised"], values["post_processed"]
     if solid is not None:
@@ -47,7 +47,7 @@ def row(name: str, source: str, summary: Mapping[str, Any]) -> dict[str, str]:
     line = {"case": name, "source": source}
     for column in ("reference", "optimised", "post_processed", "gain", "a", "theta", "b"):
         line[column] = "-" if values.get(column) is None else f"{values[column]:.3f}"
-    line["share of gain kept"] = f"{values['kept']:.0%}" if "kept" in values else "-"
+    line["share of gain retained"] = f"{values['kept']:.0%}" if "kept" in values else "-"
     return line
 
 

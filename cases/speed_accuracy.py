@@ -30,6 +30,7 @@ from typing import Any, Literal
 import crawler
 import h5py
 import numpy as np
+import peers
 import walker
 from benchmark import processor
 from exact import Bar, manufactured_error
@@ -348,9 +349,13 @@ def print_peer(name: str, robot: str) -> None:
     program.value_and_gradient()
     (value, bars), seconds = timed(program.value_and_gradient, 3)
     variables = problem.split(x)
-    material = (np.asarray(bars[key], float) for key in ("density", "lame_lambda", "lame_mu"))
+    density_bar, lambda_bar, mu_bar = (
+        np.asarray(bars[key], float) for key in ("density", "lame_lambda", "lame_mu")
+    )
+    stiffness_bar = peers.stiffness_bar(simulation, lambda_bar, mu_bar)
+    phi_bar = problem.chain.field(variables.phi).pullback(density_bar, stiffness_bar)
     signal = signal_adjoint(scene, variables.a, variables.theta, np.asarray(bars["signal"], float))
-    gradient = np.concatenate([problem.chain.field(variables.phi).pullback(*material), *signal])
+    gradient = np.concatenate([phi_bar, *signal])
     status = Path("/proc/self/status").read_text().splitlines()
     print(
         json.dumps(

@@ -22,7 +22,7 @@ import walker
 from numpy.typing import NDArray
 
 from mpmopt.app.case import START
-from mpmopt.assess.refinement import mapped, refined
+from mpmopt.assess.refinement import finer, mapped
 from mpmopt.assess.threshold import Baseline, distance, post_processed
 from mpmopt.design.actuation import signal
 from mpmopt.design.chain import interpolate
@@ -67,7 +67,7 @@ VOIDS = {
 
 
 class Row(NamedTuple):
-    """One line of the table; distances moved are in percent of the gain over the full block."""
+    """One line of the table; distances moved are in percent of the gain over the reference."""
 
     case: str
     void: str
@@ -127,7 +127,7 @@ def distance_with_void(
 
 
 def moved(scene: Scene, keep: NDArray[np.bool_], variables: Variables) -> list[str]:
-    """By how much of its gain over the full block each void moves a binary design, or why not."""
+    """By how much of its gain each void moves a binary design, or why not."""
     try:
         removed = distance(scene, keep, variables)
         gain = removed - distance(scene, np.ones_like(keep), variables)
@@ -153,7 +153,7 @@ def start_actuation() -> Variables:
 
 def rows_of(name: str, cells: int, iterations: int) -> Iterator[Row]:
     """The lines of one case, on so many cells and on twice as many."""
-    make, drawing = CASES[name]
+    make, baseline = CASES[name]
     scene = make(cells, STEP_IN_CELLS / cells)
     runs, seconds = {}, {}
     for label, void in VOIDS.items():
@@ -163,9 +163,9 @@ def rows_of(name: str, cells: int, iterations: int) -> Iterator[Row]:
         print(f"{name}, {label}: {runs[label].failed_evaluations} failed", file=sys.stderr)
     changes = [
         moved(there, keep, variables)
-        for there in (scene, refined(scene))
+        for there in (scene, finer(scene))
         # The last one's void is left out: it is as binary as they come.
-        for keep, variables in designs(there, drawing, runs[label])
+        for keep, variables in designs(there, baseline, runs[label])
     ]
     for index, (label, run) in enumerate(runs.items()):
         yield Row(
@@ -190,13 +190,13 @@ def solid_distance(run: Optimisation) -> str:
 
 
 def designs(
-    scene: Scene, drawing: Baseline, run: Optimisation
+    scene: Scene, baseline: Baseline, run: Optimisation
 ) -> list[tuple[NDArray[np.bool_], Variables]]:
-    """The drawn binary design and the optimised one, with their actuation, on a scene's grid."""
+    """The baseline design and the optimised one, with their actuation, on a scene's grid."""
     particles = discretise(scene)
-    drawn = drawing(particles.position[particles.designed])
+    there = baseline(particles.position[particles.designed])
     problem, x = run.problem(), run.result.x
-    return [(drawn, start_actuation()), (mapped(scene, problem, x), problem.split(x))]
+    return [(there, start_actuation()), (mapped(scene, problem, x), problem.split(x))]
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -21,7 +21,7 @@ import robot
 import walker
 
 import mpmopt
-from mpmopt.app.case import Case, drawn
+from mpmopt.app.case import Case, baseline_particles
 from mpmopt.app.summary import summarise
 from mpmopt.assess.trajectory import post_processed
 from mpmopt.design.problem import Problem
@@ -43,12 +43,12 @@ CASES = {
 SECONDS = 4.0  # of a film
 ROWS = {
     "start": "Start, grey all over",
-    "reference": "Full block",
-    "reference_drawn": "Drawn by hand",
+    "reference": "Solid reference design",
+    "baseline": "Baseline design",
     "optimised": "Optimised",
     "post_processed": "Post-processed",
     "actuation_off": "The same with its actuation off",
-    "gain_kept": "Gain kept with half the step; twice the step; finer cells",
+    "retained_gain": "Gain kept with half the step; twice the step; finer cells",
     "disconnected_particles": "Loose particles",
     "evaluations": "Evaluations",
     "failed_evaluations": "Failed evaluations",
@@ -70,7 +70,7 @@ def make(name: str, case: Case) -> None:
     first = settings.stages[0]
     start = Problem(first.scene(case.scene), first.beta).join(**case.start)
     result = optimise(case.scene, settings, start)
-    summary = summarise(result, drawn(Case(case.scene, settings, case.drawing)))
+    summary = summarise(result, baseline_particles(Case(case.scene, settings, case.baseline)))
     path = OUT / f"{name}.h5"
     runfile.write(path, result, summary)
     film(OUT / f"{name}.gif", result, SECONDS)

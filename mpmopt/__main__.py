@@ -5,7 +5,7 @@ examples:
   mpmopt plot out/walker/run.h5                        pictures of it
   mpmopt film out/walker/run.h5                        and a film
   mpmopt verify out/walker/run.h5                      are its gradients right?
-  mpmopt audit out/walker/run.h5                       does its design keep its gain?
+  mpmopt refine out/walker/run.h5                      does its design keep its gain?
 
 mpmopt COMMAND --help tells more. "python -m mpmopt" is the same as "mpmopt".
 
@@ -58,7 +58,7 @@ def plot(path: Path, out: Path | None, force: bool) -> int:
 
 
 def film(path: Path, out: Path | None, mp4: bool, seconds: float | None, force: bool) -> int:
-    """Write a film of a run's design, the same without grey, and the full block."""
+    """Write a film of a run's design, the same without grey, and the solid reference design."""
     from mpmopt.io.files import make_folder, refuse_existing
     from mpmopt.view.film import film as filmed
 
@@ -96,11 +96,11 @@ def postprocess(path: Path, threshold: float) -> int:
     import numpy as np
 
     from mpmopt.assess.threshold import (
-        farthest,
+        best_actuated,
         kept,
         pieces,
         post_processed,
-        share_kept,
+        retained_share,
         solid_reference,
     )
     from mpmopt.validation import digits
@@ -112,50 +112,49 @@ def postprocess(path: Path, threshold: float) -> int:
     value = post_processed(problem, x, threshold)
     reference = found.summary.get("reference")
     if reference is None:
-        reference = farthest(problem.scene, solid_reference, problem.split(x))
-    share = share_kept(problem.scene, value - reference, optimised - reference)
+        reference = best_actuated(problem.scene, solid_reference, problem.split(x))
+    share = retained_share(problem.scene, value - reference, optimised - reference)
     shown = "no gain to keep" if np.isnan(share) else f"{share:.1%}"
     sizes = np.bincount(pieces(problem.scene, keep)[keep])
     solid = f"(gamma >= {threshold:g} solid, the rest removed)"
-    print(f"reference (full block)   {digits(reference)}")
+    print(f"solid reference design   {digits(reference)}")
     print(f"optimised                {digits(optimised)}")
     print(f"post-processed           {digits(value)}  {solid}")
-    print(f"share of the gain kept   {shown}")
+    print(f"retained gain            {shown}")
     print(f"design particles kept    {keep.sum()} of {keep.size}")
     loose = ", ".join(str(size) for size in sorted(sizes[1:], reverse=True)) or "none"
     print(f"pieces hanging on nothing, particles of each: {loose}")
     return 0
 
 
-def audit(path: Path) -> int:
+def refine(path: Path) -> int:
     """Print whether a run's best design, without void, keeps its gain in other discretisations."""
     import numpy as np
 
-    from mpmopt.assess.refinement import VARIANTS, Audited
-    from mpmopt.assess.refinement import audit as audited
+    from mpmopt.assess.refinement import VARIANTS, Variant, study
     from mpmopt.io.progress import Progress
     from mpmopt.validation import digits
 
     run = _read(path).run
     with Progress("simulations", VARIANTS) as progress:
 
-        def show(row: Audited) -> None:
+        def show(row: Variant) -> None:
             progress.step(row.name)
             if row.failure:
                 progress.print(f"{row.name:<21}  no value: {row.failure}")
                 return
             cells = f"{row.cells[0]} x {row.cells[1]}"
-            kept = "" if np.isnan(row.kept) else f"{row.kept:9.0%}"
+            retained = "" if np.isnan(row.retained) else f"{row.retained:9.0%}"
             progress.print(
                 f"{row.name:<21}  {cells:>9}  {row.time_step:8.2g}  {digits(row.reference):>10}  "
-                f"{digits(row.distance):>9}  {kept}"
+                f"{digits(row.distance):>9}  {retained}"
             )
 
         progress.print(
-            f"{'post-processed design':<21}  {'cells':>9}  {'step':>8}  full block     design  "
-            "gain kept"
+            f"{'post-processed design':<21}  {'cells':>9}  {'step':>8}   reference     design  "
+            "gain retained"
         )
-        audited(run.problem(), run.result.x, progress=show)
+        study(run.problem(), run.result.x, progress=show)
     return 0
 
 
@@ -275,7 +274,7 @@ def _parser() -> argparse.ArgumentParser:
         "plot",
         "draw its scene, its designs in motion and its history",
         "Write schematic.png, history.png and, in motion, design.png (as it was optimised),\n"
-        "post_processed.png (without grey) and reference.png (the full block).",
+        "post_processed.png (without grey) and reference.png (the solid reference design).",
         "out/walker/run.h5",
         "out/walker/run.h5 --out pictures",
     )
@@ -285,8 +284,9 @@ def _parser() -> argparse.ArgumentParser:
     command = add(
         "film",
         "film its design beside the reference",
-        "Write a film of the best design, the same without grey, and the full block with the same\n"
-        "actuation, in slow motion. GIF needs nothing more; MP4 needs pip install 'mpmopt[film]'.",
+        "Write a film of the best design, the same without grey, and the solid reference\n"
+        "design with the same actuation, in slow motion. GIF needs nothing more; MP4 needs\n"
+        "pip install 'mpmopt[film]'.",
         "out/walker/run.h5",
         "out/walker/run.h5 --mp4",
         "out/walker/run.h5 --seconds 12 --out walker.gif",
@@ -320,13 +320,13 @@ def _parser() -> argparse.ArgumentParser:
     command.set_defaults(do=postprocess)
 
     command = add(
-        "audit",
+        "refine",
         "simulate its best design more finely",
         "Say how much of its gain the best design, without void, keeps with half the step, twice\n"
         "the step, and cells half as wide. Numerical propulsion keeps little.",
         "out/walker/run.h5",
     )
-    command.set_defaults(do=audit)
+    command.set_defaults(do=refine)
 
     command = add(
         "cheapest",

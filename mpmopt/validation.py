@@ -14,7 +14,7 @@ from mpmopt.errors import DesignError, MpmoptError, SceneError
 MOST = 10**8  # of anything that is counted
 # Sizes of numbers that a scene may hold, so that products of several are finite and not zero:
 # limits of what floats represent, in whatever units, which decide nothing between them.
-TINY, HUGE = 1e-30, 1e30
+SMALLEST, GREATEST = 1e-30, 1e30
 
 
 def shown(value: Any) -> str:
@@ -39,7 +39,7 @@ def number(
     above: float = -math.inf,
     error: type[MpmoptError] = SceneError,
 ) -> float:
-    """`value` as a finite float above a limit, from `TINY` to `HUGE` in size or 0; or an error."""
+    """`value` as a float above a limit, from `SMALLEST` to `GREATEST` in size or 0; or an error."""
     kinds = (int, float, np.integer, np.floating)
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, kinds):
         raise error(f"{owner}: {name} = {shown(value)} must be a number")
@@ -50,10 +50,10 @@ def number(
     if not math.isfinite(result) or not result > above:
         limit = "finite" if above == -math.inf else f"finite and above {above:g}"
         raise error(f"{owner}: {name} = {shown(value)} must be {limit}")
-    if result != 0.0 and not TINY <= abs(result) <= HUGE:
+    if result != 0.0 and not SMALLEST <= abs(result) <= GREATEST:
         raise error(
-            f"{owner}: {name} = {result!r} must be 0 or from {TINY:g} to {HUGE:g} in size; take "
-            "other units"
+            f"{owner}: {name} = {result!r} must be 0 or from {SMALLEST:g} to {GREATEST:g} in size; "
+            "take other units"
         )
     return result
 

@@ -74,4 +74,4 @@ def short_run(short_path):
 
 def empty(scene: Scene):
     """A run of a scene before its first evaluation."""
-    return begin(scene, SHORT, [Problem(scene).join(0.3, 1.0, -0.3, -0.5)])
+    return begin(scene, SHORT, Problem(scene).join(0.3, 1.0, -0.3, -0.5))

@@ -229,10 +229,10 @@ def test_going_back_twice_is_refused(rough_walker, every):
     simulation = problem.simulation(x)
     with simulation.checkpoints(Checkpointing(every)) as checkpoints:
         forward = simulation.forward(checkpoints)
-        seeds = problem.objective(simulation).terminal_adjoints(forward.states)
-        forward.reverse(seeds)
+        terminal_adjoints = problem.objective(simulation).terminal_adjoints(forward.states)
+        forward.reverse(terminal_adjoints)
         with pytest.raises(DesignError, match="run forward again"):
-            forward.reverse(seeds)
+            forward.reverse(terminal_adjoints)
 
 
 def test_a_store_that_lost_its_data_says_so(tmp_path):
@@ -255,8 +255,7 @@ def test_windows_that_outgrow_the_store_are_recomputed():
         state[0:2] = particles.position.T
         state[2:4] = [[9.0], [14.0]] * (state[0:2] - state[0:2].mean(axis=1, keepdims=True))
         state[[8, 11]] = 1.0
-        weak = 1e-9 * ones
-        simulation = Simulation(scene, particles, ones, weak, weak, np.zeros((40, 2)), state)
+        simulation = Simulation(scene, particles, ones, 1e-10 * ones, np.zeros((40, 2)), state)
         with simulation.checkpoints(Checkpointing(every, store="memory")) as checkpoints:
             forward = simulation.forward(checkpoints)
             objective = Objective.of(scene, particles, (0.6, 0.8))
@@ -301,9 +300,11 @@ def test_instants_and_seeds_that_are_none_are_refused():
     for wrong in ([5], [-1], [1.5]):
         with pytest.raises(DesignError, match="instants must be whole numbers of steps from 0 to"):
             simulation.watch(wrong)
-    for seeds in ({5: simulation.initial}, {-1: simulation.initial}, {4: np.zeros(3)}):
+    for terminal_adjoints in ({5: simulation.initial}, {-1: simulation.initial}, {4: np.zeros(3)}):
         with (
             simulation.checkpoints(Checkpointing(store="memory")) as store,
-            pytest.raises(DesignError, match=r"seeds has shape .* must have \(12, 48\) at steps"),
+            pytest.raises(
+                DesignError, match=r"terminal_adjoints has shape .* must have \(12, 48\) at steps"
+            ),
         ):
-            simulation.forward(store).reverse(seeds)
+            simulation.forward(store).reverse(terminal_adjoints)

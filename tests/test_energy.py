@@ -49,7 +49,7 @@ def one_step(dt, rng):
     state[8:12] += rng.uniform(-0.2, 0.2, (4, len(particles.position)))
     ones = rng.uniform(0.5, 1.0, len(particles.position))
     signal = np.array([[1.3, -0.8]])
-    return Simulation(scene, particles, ones, 8.0 * ones, 9.0 * ones, signal, state)
+    return Simulation(scene, particles, ones, ones, signal, state)
 
 
 def test_what_a_step_gains_is_what_the_actuators_give():

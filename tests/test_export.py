@@ -28,8 +28,7 @@ from mpmopt.errors import (
     SimulationError,
     StorageError,
 )
-from mpmopt.optimisation.history import Candidate
-from mpmopt.optimisation.loop import begin
+from mpmopt.optimisation.history import Candidate, Optimisation
 from mpmopt.optimisation.settings import Settings, Stage
 from mpmopt.results import export as exporting
 from mpmopt.results import runfile
@@ -108,7 +107,7 @@ def test_the_outline_passes_between_particles_that_stay_and_particles_that_go(ho
         assert np.array_equal(inside, gamma[clear] >= threshold)
 
 
-def test_a_full_block_is_its_rectangle_and_an_empty_one_what_is_solid():
+def test_a_solid_reference_design_is_its_rectangle_and_an_empty_one_what_is_solid():
     problem = Problem(walker(64, 8e-4), beta=4.0)
     for phi, low in ((1.0, 4), (-1.0, 11)):
         (polygon,) = outline(problem, problem.join(phi, 1.0, 0.0, 0.0))
@@ -447,15 +446,15 @@ def test_a_folder_that_cannot_be_made_is_a_storage_error(holed, tmp_path):
 def run_file(path, problem, x):
     """A run file with a design, as if it had been found."""
     stage = Stage(problem.chain.beta, 1e-2, 1e-3, problem.scene.time_step)
-    run = begin(problem.scene, Settings((stage,)), x)
+    run = Optimisation(problem.scene, Settings((stage,)), x)
     numbers: Any = dict.fromkeys(
         ("move_limit", "non_discreteness", "projected_gradient", "step"), 0.1
     )
     item = Candidate(
-        start=0, stage=0, beta=stage.beta, time_step=stage.time_step, objective=0.5,
+        stage=0, beta=stage.beta, time_step=stage.time_step, objective=0.5,
         seconds=1.0, x=x, gamma=problem.gamma(x), **numbers,
     )  # fmt: skip
-    run.legs[0].best[0] = run.first = run.last = item
+    run.best[0] = run.first = run.last = item
     run.history.append(item)
     runfile.write(path, run)
     return path

@@ -74,7 +74,7 @@ def test_bodies_are_where_their_particles_are_and_move(short_run):
     height = len(pictures[0])
     for panel, motion in zip(screen.panels, shown):
         problem, x = short_run.problem(), short_run.result.x
-        body = {"o": optimised, "p": post_processed, "f": reference}[motion.name[0]](problem, x)
+        body = {"o": optimised, "p": post_processed, "s": reference}[motion.name[0]](problem, x)
         solid = (body.gamma >= 0.9) & (body.simulation.particles.actuator < 0)
         assert solid.sum() >= 4
         for number, step in enumerate(motion.frames):

@@ -28,7 +28,7 @@ def one_step(scene, state, signal=0.0, dtype=float):
     particles = discretise(scene)
     ones = np.ones(len(particles.position), dtype)
     simulation = Simulation(
-        scene, particles, ones, 10.0 * ones, 10.0 * ones,
+        scene, particles, ones, ones,
         np.full((scene.steps, len(scene.actuators)), signal), state,
     )  # fmt: skip
     groups, nodes = len(simulation.data.mass), 400
@@ -91,7 +91,7 @@ def test_nodes_that_are_hardly_touched_spoil_nothing(state, off):
     ones = np.ones(state.shape[1])
     signal = np.full((scene.steps, 2), 0.5)
     particles = discretise(scene)
-    simulation = Simulation(scene, particles, ones, 10.0 * ones, 10.0 * ones, signal, state)
+    simulation = Simulation(scene, particles, ones, ones, signal, state)
     expected = step(simulation, state, 0)
     found = simulation.run([1])[0]
     assert np.abs(found - expected).max() <= 1e-12 * np.abs(expected).max()
@@ -127,7 +127,7 @@ def test_kernels_do_what_the_equations_say_node_by_node(state, blend_time, dtype
     particles = discretise(scene)
     ones = np.ones(len(particles.position), dtype)
     signal = np.full((scene.steps, 2), 0.5)
-    simulation = Simulation(scene, particles, ones, 10.0 * ones, 7.0 * ones, signal, expected)
+    simulation = Simulation(scene, particles, ones, 0.8 * ones, signal, expected)
     for n, found in zip(range(4), simulation.run(range(5))):
         assert np.abs(found - expected).max() <= 1e-13 * np.abs(expected).max()
         expected = step(simulation, expected, n)
@@ -142,7 +142,7 @@ def test_particles_on_the_edge_of_two_cells_get_their_own_nodes_velocities(dx, p
     particles = discretise(scene)
     ones = np.ones(len(particles.position))
     signal = np.full((scene.steps, 1), 0.3)
-    simulation = Simulation(scene, particles, ones, 10.0 * ones, 10.0 * ones, signal)
+    simulation = Simulation(scene, particles, ones, ones, signal)
     expected = simulation.initial
     for n, found in enumerate(simulation.run([1, 2])):
         expected = step(simulation, expected, n)

@@ -12,7 +12,7 @@ from mpmopt.assess import refinement
 from mpmopt.design import chain
 from mpmopt.design.problem import Problem
 from mpmopt.errors import DesignError, SceneError, SimulationError
-from mpmopt.optimisation.history import Candidate, Leg, Optimisation
+from mpmopt.optimisation.history import Candidate, Optimisation
 from mpmopt.optimisation.loop import go_on, optimise
 from mpmopt.optimisation.settings import Settings, Stage
 
@@ -107,10 +107,10 @@ def test_a_coarse_stage_hands_its_farthest_design_to_the_finer_grid(monkeypatch)
     run, designs = tried(scene, settings, coarse.join(0.0, 1.0, -0.3, -0.5))
     first, second = (next(item for item in designs if item.stage == stage) for stage in (0, 1))
     assert 4 * (first.x.size - 3) == second.x.size - 3
-    # The farthest as it is goes on, though the best is the farthest without void.
-    farthest = max((i for i in designs if i.stage == 0), key=lambda item: item.objective)
-    assert farthest is not run.best[0]
-    assert np.array_equal(second.x, Problem(scene).transfer(coarse, farthest.x))
+    # The incumbent as it is goes on, though the best is the incumbent without void.
+    incumbent = max((i for i in designs if i.stage == 0), key=lambda item: item.objective)
+    assert incumbent is not run.best[0]
+    assert np.array_equal(second.x, Problem(scene).transfer(coarse, incumbent.x))
     assert second.step == 0.0
     assert run.result.stage == 1  # whatever the coarse grid says
 
@@ -155,7 +155,7 @@ def test_a_stage_whose_first_design_fails_halves_its_step(scene, start, monkeypa
 def test_a_stage_whose_first_design_fails_takes_the_best_of_the_one_before(
     scene, start, monkeypatch
 ):
-    without_void = iter((0.4, 0.1, 0.2))  # so that the best is not the farthest
+    without_void = iter((0.4, 0.1, 0.2))  # so that the best is not the incumbent
     monkeypatch.setattr(
         "mpmopt.optimisation.loop.post_processed", lambda problem, x: next(without_void)
     )
@@ -163,8 +163,8 @@ def test_a_stage_whose_first_design_fails_takes_the_best_of_the_one_before(
     stages = (dataclasses.replace(STAGES[0], solid=True), dataclasses.replace(STAGES[0], beta=2.0))
     settings = Settings(stages, window=1, least_iterations=3, most_iterations=3)
     run = optimise(scene, settings, start)
-    farthest = max(run.history[:3], key=lambda item: item.objective)
-    assert farthest.objective > run.best[0].objective
+    incumbent = max(run.history[:3], key=lambda item: item.objective)
+    assert incumbent.objective > run.best[0].objective
     assert not np.array_equal(calls[3][1], run.best[0].x)
     assert [step for step, _ in calls[3:6]] == [4e-3, 4e-3, 2e-3]
     assert all(np.array_equal(x, run.best[0].x) for _, x in calls[4:6])
@@ -208,7 +208,7 @@ def test_the_result_is_the_design_that_goes_farthest_without_void(scene, start):
     assert run.result.post_processed == max(item.post_processed for item in run.history)
 
 
-def test_a_design_counts_with_the_least_of_its_audit(scene, start, monkeypatch):
+def test_a_design_counts_with_the_least_of_its_refinement_study(scene, start, monkeypatch):
     solid = iter((0.1, 0.4, 0.2, 0.15, 0.3, np.nan, 0.5))
     found = iter((0.05, 0.15, 0.3, SimulationError("torn", 1, -1, (0.0, 0.0), "none"), 0.45))
     asked = []
@@ -225,105 +225,53 @@ def test_a_design_counts_with_the_least_of_its_audit(scene, start, monkeypatch):
 
     monkeypatch.setattr("mpmopt.optimisation.loop.post_processed", post_processed)
     monkeypatch.setattr("mpmopt.assess.refinement.least", least)
-    stage = dataclasses.replace(STAGES[1], audited=True)
+    stage = dataclasses.replace(STAGES[1], refined=True)
     settings = Settings((stage,), window=1, least_iterations=7, most_iterations=7)
     run, designs = tried(scene, settings, start)
     counted = [item.counted for item in run.history]
     assert counted == [0.05, 0.15, 0.2, 0.15, -np.inf, -np.inf, 0.45]
-    assert [len(asked), run.result.post_processed, run.result.audited] == [5, 0.5, 0.45]
+    assert [len(asked), run.result.post_processed, run.result.refined] == [5, 0.5, 0.45]
     assert np.array_equal(run.result.x, designs[6].x)
 
 
-def test_what_an_audited_stage_asks_is_what_the_audit_tells(scene, start):
-    stage = dataclasses.replace(STAGES[1], audited=True)
+def test_what_a_refined_stage_asks_is_what_the_study_tells(scene, start):
+    stage = dataclasses.replace(STAGES[1], refined=True)
     settings = Settings((stage,), window=1, least_iterations=4, most_iterations=4)
     run = optimise(scene, settings, start)
-    rows = {row.name: row for row in refinement.audit(run.problem(), run.result.x)}
+    rows = {row.name: row for row in refinement.study(run.problem(), run.result.x)}
     others = rows["half the step"].distance, rows["cells half as wide"].distance
-    assert run.result.audited == min(others)
+    assert run.result.refined == min(others)
     assert others[0] != others[1]
     assert run.result.post_processed == rows["as designed"].distance
-    assert run.result.counted == min(run.result.audited, run.result.post_processed)
+    assert run.result.counted == min(run.result.refined, run.result.post_processed)
 
 
-def candidate(stage, objective, post_processed=np.nan, audited=np.nan):
+def candidate(stage, objective, post_processed=np.nan, refined=np.nan):
     return Candidate(
-        start=0, stage=stage, beta=1.0, time_step=1e-3, move_limit=0.1, objective=objective,
+        stage=stage, beta=1.0, time_step=1e-3, move_limit=0.1, objective=objective,
         non_discreteness=0.0, projected_gradient=0.0, step=0.0, seconds=0.0, x=np.zeros(1),
-        gamma=np.zeros(1), post_processed=post_processed, audited=audited,
+        gamma=np.zeros(1), post_processed=post_processed, refined=refined,
     )  # fmt: skip
 
 
-def test_the_result_is_never_a_design_that_no_audit_saw_if_there_is_one(scene):
+def test_the_result_is_never_a_design_that_no_refinement_saw_if_there_is_one(scene):
     solid = dataclasses.replace(STAGES[0], solid=True)
-    stages = (solid, dataclasses.replace(solid, audited=True))
+    stages = (solid, dataclasses.replace(solid, refined=True))
     best = {0: candidate(0, 0.6, 0.55), 1: candidate(1, 0.6, 0.54, 0.5)}
-    run = Optimisation(scene, Settings(stages), [Leg(0, np.zeros(1), best=best)])
+    run = Optimisation(scene, Settings(stages), np.zeros(1), best=best)
     assert run.result is best[1]
-    best[1] = candidate(1, 0.6, 0.54, -np.inf)  # it has no audit that ran
+    best[1] = candidate(1, 0.6, 0.54, -np.inf)  # it has no refinement study that ran
     assert run.result is best[0]
-
-
-def test_a_start_whose_design_fails_without_void_does_not_beat_a_sound_one(
-    scene, start, monkeypatch
-):
-    problem = Problem(STAGES[0].scene(scene), STAGES[0].beta)
-    far = 1.0 if problem.value(start) > problem.value(0.5 * start) else 0.5
-    solid = dataclasses.replace(STAGES[0], solid=True)
-    settings = Settings((solid, solid), window=1, least_iterations=2, most_iterations=2, scouting=1)
-
-    def post_processed(problem, x):
-        sound = min(abs(x[-6:]).max(), 1.0)  # of the start's amplitude
-        if (sound > 0.75) == (far == 1.0):
-            raise SimulationError("made to fail", 3, 1, (0.0, 0.0), "none")
-        return 0.1
-
-    monkeypatch.setattr("mpmopt.optimisation.loop.post_processed", post_processed)
-    run = optimise(scene, settings, [start, 0.5 * start])
-    assert run.result.start == (1 if far == 1.0 else 0)
 
 
 def test_a_run_that_was_changed_is_refused(scene, start):
     run = optimise(
         scene, Settings(STAGES[:1], window=1, least_iterations=2, most_iterations=2), start
     )
-    changes: list[dict[str, Any]] = [{"start": 5}, {"stage": -1}, {"stage": 2}]
+    changes: list[dict[str, Any]] = [{"stage": -1}, {"stage": 2}]
     for change in changes:
-        legs = [dataclasses.replace(run.legs[0], **change)]
-        with pytest.raises(DesignError, match="run was changed"):
-            go_on(dataclasses.replace(run, legs=legs, stop_reason=""))
-
-
-def test_of_several_starts_the_best_goes_on(scene, start):
-    problem = Problem(scene)
-    other = problem.join(0.0, 1.0, 0.7, -0.5)
-    settings = dataclasses.replace(QUICK, scouting=1, least_iterations=11, most_iterations=11)
-    run = optimise(scene, settings, [start, other])
-    assert [(item.start, item.stage) for item in run.history[:22]] == 11 * [(0, 0)] + 11 * [(1, 0)]
-    scouted = [max(item.objective for item in run.history if item.start == k and item.stage == 0)
-               for k in (0, 1)]  # fmt: skip
-    winner = int(np.argmax(scouted))
-    assert scouted[0] != scouted[1]
-    assert {item.start for item in run.history[22:]} == {winner}
-    assert run.best[0].objective == scouted[winner]
-    assert run.result.start == winner
-    # The winner's way is the one it goes alone.
-    alone = optimise(scene, dataclasses.replace(settings, scouting=0), [start, other][winner])
-    assert np.array_equal(alone.result.x, run.result.x)
-
-
-def test_a_start_that_never_runs_does_not_stop_the_others(scene, start, monkeypatch):
-    fail_on(monkeypatch, set(range(4)))
-    settings = dataclasses.replace(QUICK, scouting=1, least_iterations=11, most_iterations=11)
-    run = optimise(scene, settings, [start, 0.5 * start])
-    assert run.result.start == 1
-    assert run.stop_reason.startswith("Stage 2 of 2")
-
-
-@pytest.mark.parametrize("scouting", [0, -1, 3, 1.5])
-def test_senseless_scouting_is_refused(scene, start, scouting):
-    with pytest.raises(DesignError, match="scouting"):
-        optimise(scene, dataclasses.replace(QUICK, scouting=scouting), [start, start])
+        with pytest.raises(DesignError, match="it was changed"):
+            go_on(dataclasses.replace(run, stop_reason="", **change))
 
 
 def test_a_start_that_does_not_fit_is_refused(scene):
@@ -362,7 +310,7 @@ def test_a_stage_that_never_runs_gives_up_after_three_halvings(scene, start, mon
         {"coarsening": 1.5},
         {"void_cutoff": -0.1},
         {"void_cutoff": 1.0},
-        {"audited": True},
+        {"refined": True},
         {"solid": "no"},
         {"most_iterations": 0},
     ],
@@ -406,8 +354,8 @@ def test_a_step_filters_and_projects_its_design_once_however_it_is_judged(start,
         return real(phi, beta)
 
     monkeypatch.setattr(chain, "project", project)
-    stage = Stage(4.0, 1e-2, 1e-3, 4e-3, solid=True, audited=True, void_cutoff=0.05)
+    stage = Stage(4.0, 1e-2, 1e-3, 4e-3, solid=True, refined=True, void_cutoff=0.05)
     settings = Settings((stage,), least_iterations=3, most_iterations=3)
     run = optimise(small_scene(steps=6), settings, start)
     assert len(run.history) == len(projected) == 3
-    assert np.isfinite(run.history[0].audited)
+    assert np.isfinite(run.history[0].refined)

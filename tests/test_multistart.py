@@ -22,7 +22,7 @@ from mpmopt.app.case import Case, run
 from mpmopt.app.multistart import AMPLITUDE, LENGTH, best_of, random_start, report
 from mpmopt.app.script import main
 from mpmopt.app.sweeps import sweep
-from mpmopt.assess.refinement import audit
+from mpmopt.assess.refinement import study
 from mpmopt.design.problem import Problem
 from mpmopt.errors import StorageError, SweepError
 from mpmopt.io.console import Interrupted
@@ -66,22 +66,22 @@ def test_every_grid_begins_with_the_same_field():
     assert np.ptp(start[: coarse.particles.designed.sum()]) > 0.5
 
 
-def row(start, gain, audited):
+def row(start, gain, refined):
     return {
-        "start": start, "post_processed": 0.2 + gain, "gain": gain, "kept_half_step": 1.0,
-        "kept_half_cells": audited / gain, "audited_gain": audited, "disconnected_particles": 0,
+        "start": start, "post_processed": 0.2 + gain, "gain": gain, "retained_half_step": 1.0,
+        "retained_half_cells": refined / gain, "refined_gain": refined, "disconnected_particles": 0,
         "failed_evaluations": 0, "seconds": 1.0,
     }  # fmt: skip
 
 
-def test_the_best_is_named_after_its_audit():
+def test_the_best_is_named_after_its_refinement_study():
     rows = [row(0, 0.3, 0.1), row(1, 0.2, 0.19), row(2, 0.4, math.nan), row(3, 0.1, 0.1)]
     assert best_of(rows)["start"] == 1
     assert best_of(rows[2:3])["start"] == 2
     lines = report(rows).splitlines()
-    assert lines[-1] == "best after its audit: start-1, gain 0.190"
+    assert lines[-1] == "best after its refinement study: start-1, gain 0.190"
     assert lines[-3].startswith("gain: 0.100 to 0.400, median 0.250")
-    assert lines[-2].startswith("audited gain: 0.100 to 0.190, median 0.100")
+    assert lines[-2].startswith("refined gain: 0.100 to 0.190, median 0.100")
     assert len({len(line) for line in lines[:5]}) == 1
 
 
@@ -126,10 +126,10 @@ def test_starts_leave_their_runs_and_are_run_once(tmp_path, capsys, caplog):
     last = runfile.read_run(kept[1]).run
     gains = {
         row.name: row.distance - max(row.reference, summary["reference"])
-        for row in audit(last.problem(), last.result.x)
+        for row in study(last.problem(), last.result.x)
     }
     del gains["twice the step"]
-    assert float(line["audited gain"]) == pytest.approx(min(gains.values()), rel=1e-3)
+    assert float(line["refined gain"]) == pytest.approx(min(gains.values()), rel=1e-3)
     assert len({line["optimised"] for line in rows}) == 2
     (tmp_path / "starts.png").unlink()
     shutil.rmtree(tmp_path / "start-0")
@@ -158,18 +158,18 @@ def test_the_plain_start_is_that_of_the_case(tmp_path, here):
 def test_a_loss_is_not_scaled(tmp_path, monkeypatch):
     gain: dict[str, Any] = {"as designed": -0.1, "half the step": -0.05, "twice the step": -9.0,
             "cells half as wide": -0.2}  # fmt: skip
-    summary: Any = collections.defaultdict(float, gain=gain, gain_kept=gain)
+    summary: Any = collections.defaultdict(float, gain=gain, retained_gain=gain)
     monkeypatch.setattr(multistart, "run", lambda *_, **__: summary)
 
-    def audited():
+    def refined():
         return multistart.one_start(
             SCENE.to_json(), dataclasses.asdict(TINY.settings), dict(TINY.start), 0,
-            drawing=slanted_legs, out=tmp_path,
-        )["audited_gain"]  # fmt: skip
+            baseline=slanted_legs, out=tmp_path,
+        )["refined_gain"]  # fmt: skip
 
-    assert audited() == -0.2
+    assert refined() == -0.2
     gain["half the step"] = None
-    assert math.isnan(audited())
+    assert math.isnan(refined())
 
 
 @pytest.mark.case
@@ -229,9 +229,9 @@ def test_starts_and_scheduler_must_make_sense(tmp_path, capsys, wrong):
 
 
 def test_what_is_no_number_is_shown_as_none():
-    without = {**row(0, 0.3, math.nan), "kept_half_step": math.nan}
+    without = {**row(0, 0.3, math.nan), "retained_half_step": math.nan}
     lines = report([without]).splitlines()
     assert "nan" not in "".join(lines)
     assert lines[1].count(" -") == 3
     assert len(lines[0]) == len(lines[1])
-    assert lines[-1] == "best after its audit: start-0, which has no audited gain"
+    assert lines[-1] == "best after its refinement study: start-0, which has no refined gain"

@@ -155,7 +155,7 @@ def barely_touching(seed, blend_time, change=0.0):
     state[[8, 11]] += 1.0
     ones = np.ones(count)
     signal = np.full((scene.steps, 2), 0.5)
-    return Simulation(scene, particles, ones, 10.0 * ones, 10.0 * ones, signal, state + change)
+    return Simulation(scene, particles, ones, ones, signal, state + change)
 
 
 # Of the first hundred, those where such a node would spoil something, compiled or not.

@@ -46,9 +46,7 @@ def parts():
     state = np.zeros((12, count))
     state[0:2], state[8], state[11] = particles.position.T, 1.0, 1.1
     inputs = {name: array.copy() for name, array in arrays(particles).items()}
-    material = {
-        name: rng.uniform(5.0, 9.0, count) for name in ("density", "lame_lambda", "lame_mu")
-    }
+    material = {name: rng.uniform(0.5, 0.9, count) for name in ("density", "stiffness")}
     signal = rng.uniform(-1.0, 1.0, (12, 2))
     return inputs, {**material, "signal": signal, "state": state}
 
@@ -57,11 +55,11 @@ def results(simulation, every, change=lambda: None, memory=None):
     with simulation.checkpoints(Checkpointing(every=every)) as store:
         objective = Objective.of(SCENE, simulation.particles)
         forward = simulation.forward(store, memory, objective.instants)
-        seeds = objective.terminal_adjoints(forward.states)
+        terminal_adjoints = objective.terminal_adjoints(forward.states)
         value = objective.value(forward.states)
         change()
         spoil(*forward.states.values())
-        gradient = forward.reverse(seeds)
+        gradient = forward.reverse(terminal_adjoints)
     return [np.array(value), *arrays(gradient).values()]
 
 
@@ -182,7 +180,7 @@ def test_an_optimisation_keeps_its_own():
     [
         ("density", lambda a: a.astype(str)),
         ("signal", lambda a: np.ma.masked_greater(a, 0.5)),
-        ("lame_mu", lambda a: a > 0.0),
+        ("stiffness", lambda a: a > 0.0),
         ("state", lambda a: a.astype(object)),
     ],
 )

@@ -41,17 +41,17 @@ def test_bodies_without_void_go_its_way(pair):
         own, same = (distance(problem, x) for problem in pair)
         assert own == same
     block, split = threshold.solid_reference, pair[0].split(x)
-    own = threshold.farthest(SCENE, block, split, objective=pair[0].objective)
-    assert own == threshold.farthest(pair[1].scene, block, split)
+    own = threshold.best_actuated(SCENE, block, split, objective=pair[0].objective)
+    assert own == threshold.best_actuated(pair[1].scene, block, split)
 
 
-def test_pictures_and_audits_show_it(pair):
+def test_pictures_and_studies_show_it(pair):
     x = smooth(pair[0])
     for body in (trajectory.optimised, trajectory.post_processed, trajectory.reference):
         own, same = (Motion.of(body(problem, x), [0, 8, 16]) for problem in pair)
         assert np.array_equal(own.objective, same.objective)
-    audits = [refinement.audit(problem, x) for problem in pair]
-    own_rows, same_rows = ([(row.reference, row.distance) for row in rows] for rows in audits)
+    studies = [refinement.study(problem, x) for problem in pair]
+    own_rows, same_rows = ([(row.reference, row.distance) for row in rows] for rows in studies)
     assert own_rows == same_rows
 
 

@@ -85,7 +85,7 @@ def test_pictures_are_the_same_whatever_the_users_style_is(
     body = optimised(short_run.problem(), short_run.result.x)
     motion = Motion.of(body, [0, 20])
     shutil.copytree(short_path.parent, tmp_path / "start-0")
-    row = {"start": 0, "gain": 0.1, "audited_gain": 0.05}
+    row = {"start": 0, "gain": 0.1, "refined_gain": 0.05}
 
     def content():
         plot.plot_motion(tmp_path / "motion.png", body, 1)
@@ -165,7 +165,6 @@ def test_a_history_marks_each_stage_and_failure_where_it_is():
             objective=[0.2, 0.3, np.nan, 0.4, 0.5, 0.6],
             beta=[0.5, 0.5, 0.5, 1.0, 0.5, 0.5],
             stage=[0, 0, 0, 1, 0, 0],
-            start=[0, 0, 0, 0, 1, 1],
         ),
     )
     lines = {line.get_label(): line for line in axes.lines}

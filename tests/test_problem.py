@@ -8,7 +8,7 @@ import pytest
 from conftest import small_scene, worst
 from walker import walker
 
-from mpmopt.assess.threshold import distance, farthest, pieces, post_processed, solid_reference
+from mpmopt.assess.threshold import best_actuated, distance, pieces, post_processed, solid_reference
 from mpmopt.assess.verify import COMPLEX_STEP, COMPLEX_TOLERANCE, complex_step_test
 from mpmopt.design.problem import Problem
 from mpmopt.errors import DesignError, SimulationError
@@ -214,8 +214,8 @@ def test_a_black_design_without_its_void_is_the_solid_body(problem):
     assert problem.value(black) == pytest.approx(value, rel=1e-13)
     assert post_processed(problem, black) == pytest.approx(value, rel=1e-13)
     still, moving = (problem.split(problem.join(0.0, a, -0.3, 0.0)) for a in (0.0, 0.9))
-    values = [farthest(problem.scene, solid_reference, v) for v in (still, moving)]
-    assert farthest(problem.scene, solid_reference, still, moving) == max(values)
+    values = [best_actuated(problem.scene, solid_reference, v) for v in (still, moving)]
+    assert best_actuated(problem.scene, solid_reference, still, moving) == max(values)
     assert distance(problem.scene, everything, moving) == values[1]
 
 

@@ -1,4 +1,4 @@
-"""Audits: the same robot in other discretisations."""
+"""Refinement studies: the same robot in other discretisations."""
 
 import dataclasses
 
@@ -10,8 +10,8 @@ from crawler import crawler
 from walker import slanted_legs, walker
 
 from mpmopt.__main__ import main
-from mpmopt.assess.refinement import audit, refined
-from mpmopt.assess.threshold import distance, share_kept
+from mpmopt.assess.refinement import finer, study
+from mpmopt.assess.threshold import distance, retained_share
 from mpmopt.design.problem import Problem
 from mpmopt.errors import SceneError
 from mpmopt.optimisation.loop import optimise
@@ -20,33 +20,33 @@ from mpmopt.scene import Actuator
 from mpmopt.scene.particles import discretise
 
 
-def drawn(scene):
-    """The legs drawn by hand as a design of a problem."""
+def baseline(scene):
+    """The legs baseline by hand as a design of a problem."""
     problem = Problem(scene, 32.0)
     position = problem.particles.position[problem.particles.designed]
     return problem, problem.join(np.where(slanted_legs(position), 1.0, -1.0), 1.0, -0.3, -0.5)
 
 
-def test_an_audit_simulates_the_same_robot_with_other_steps_and_cells():
-    problem, x = drawn(walker(64, 4e-4))
+def test_a_refinement_study_simulates_the_same_robot_with_other_steps_and_cells():
+    problem, x = baseline(walker(64, 4e-4))
     scene = problem.scene
-    rows = {row.name: row for row in audit(problem, x)}
+    rows = {row.name: row for row in study(problem, x)}
     assert list(rows) == ["as designed", "half the step", "twice the step", "cells half as wide"]
     assert [row.time_step for row in rows.values()] == [4e-4, 2e-4, 8e-4, 2e-4]
     assert rows["cells half as wide"].cells == (128, 128)
-    assert rows["as designed"].kept == 1.0
+    assert rows["as designed"].retained == 1.0
     keep = problem.gamma(x) >= 0.3
     half = scene.vary(time_step=2e-4)
     assert rows["half the step"].distance == distance(half, keep, problem.split(x))
     gains = {name: row.distance - row.reference for name, row in rows.items()}
     for name, row in rows.items():
-        assert row.kept == pytest.approx(gains[name] / gains["as designed"])
-        assert 0.3 < row.kept < 1.6
+        assert row.retained == pytest.approx(gains[name] / gains["as designed"])
+        assert 0.3 < row.retained < 1.6
 
 
 def test_the_finer_robot_has_the_same_shape():
     for scene in (walker(64, 8e-4), crawler(64, 8e-4), small_scene()):
-        fine = refined(scene)
+        fine = finer(scene)
         assert fine.courant == pytest.approx(scene.courant)
         assert fine.duration == pytest.approx(scene.duration)
         areas = [discretise(each).volume.sum() for each in (scene, fine)]
@@ -59,42 +59,42 @@ def test_what_cannot_be_simulated_says_why():
         time_step=scene.duration / np.ceil(scene.duration / (0.9 * scene.largest_time_step))
     )
     problem = Problem(scene)
-    rows = {row.name: row for row in audit(problem, problem.join(0.5, 0.1, 0.2, 0.1))}
+    rows = {row.name: row for row in study(problem, problem.join(0.5, 0.1, 0.2, 0.1))}
     assert "time_step" in rows["twice the step"].failure
-    assert np.isnan(rows["twice the step"].kept)
+    assert np.isnan(rows["twice the step"].retained)
     assert not rows["half the step"].failure
 
 
 def test_a_body_without_design_is_audited_too():
     c = 1 / 16
     problem = Problem(small_scene(body=(Actuator((3 * c, 5 * c), (6 * c, 7 * c)),)))
-    rows = audit(problem, problem.join(np.empty(0), 0.2, 0.1, 0.1))
+    rows = study(problem, problem.join(np.empty(0), 0.2, 0.1, 0.1))
     assert rows[1].distance == rows[1].reference
-    assert np.isnan(rows[1].kept)
+    assert np.isnan(rows[1].retained)
 
 
 def test_a_wide_filter_is_no_obstacle_to_finer_cells():
     """Refined once more it would be too large for a scene, but solid bodies need none."""
     scene = climber(128, 5e-4)
     with pytest.raises(SceneError, match="shorter filter_length"):
-        dataclasses.replace(refined(scene), filter_length=scene.filter_length)
-    assert refined(scene).grid.cells == (256, 256)
+        dataclasses.replace(finer(scene), filter_length=scene.filter_length)
+    assert finer(scene).grid.cells == (256, 256)
 
 
 def test_no_share_of_a_gain_that_is_rounding(tmp_path, capsys):
-    """A body without design is the full block itself: nothing is gained, and nothing kept."""
+    """A body without design is the reference itself: nothing is gained, and nothing retained."""
     for kept, gain in ((0.0, 0.0), (3e-17, 1e-17), (1e-17, -1e-17), (0.1, -0.1)):
-        assert np.isnan(share_kept(small_scene(), kept, gain))
-    assert share_kept(small_scene(), 0.05, 0.1) == 0.5
+        assert np.isnan(retained_share(small_scene(), kept, gain))
+    assert retained_share(small_scene(), 0.05, 0.1) == 0.5
     c = 1 / 16
     scene = small_scene(steps=5, body=(Actuator((3 * c, 5 * c), (6 * c, 7 * c)),))
     x = Problem(scene).join(np.empty(0), 0.2, 0.1, 0.1)
     path = tmp_path / "run.h5"
     runfile.write(path, optimise(scene, SHORT, x))
-    for name in ("postprocess", "audit"):
+    for name in ("postprocess", "refine"):
         assert main([name, str(path)]) == 0
         said = capsys.readouterr()
         assert "nan" not in said.out + said.err
         assert "Warning" not in said.err
     assert main(["postprocess", str(path)]) == 0
-    assert "share of the gain kept   no gain to keep" in capsys.readouterr().out
+    assert "retained gain            no gain to keep" in capsys.readouterr().out

@@ -9,7 +9,7 @@ import pytest
 from conftest import small_scene
 
 from mpmopt.design.problem import Problem
-from mpmopt.optimisation.history import Candidate, Iteration, Leg, Optimisation, StageState
+from mpmopt.optimisation.history import Candidate, Iteration, Optimisation, StageState
 from mpmopt.optimisation.loop import begin
 from mpmopt.optimisation.mma import MovingAsymptotes
 from mpmopt.optimisation.settings import Settings, Stage
@@ -65,26 +65,22 @@ def asymptotes():
 @pytest.fixture
 def run():
     stages = [
-        distinct(Stage, audited=True, solid=True, coarsening=2),
-        distinct(Stage, audited=True, solid=True, coarsening=2),
+        distinct(Stage, refined=True, solid=True, coarsening=2),
+        distinct(Stage, refined=True, solid=True, coarsening=2),
     ]
-    settings = distinct(
-        Settings, stages=tuple(stages), scouting=1, least_iterations=3, most_iterations=5
-    )
-    legs = [
-        distinct(Leg, start=k + 1, stage=k + 1, best={1: distinct(Candidate, stage=1)})
-        for k in range(2)
-    ]
+    settings = distinct(Settings, stages=tuple(stages), least_iterations=3, most_iterations=5)
     state = distinct(
-        StageState, mma=asymptotes(), farthest=distinct(Candidate),
-        farthest_gradient=np.array([1.0, 2.0, 3.0]),
+        StageState, mma=asymptotes(), incumbent=distinct(Candidate),
+        incumbent_gradient=np.array([1.0, 2.0, 3.0]),
     )  # fmt: skip
     return distinct(
         Optimisation,
         scene=small_scene(),
         settings=settings,
-        legs=legs,
-        leg=1,
+        x=np.array([0.5, -0.25]),
+        stage=1,
+        gave_up=True,
+        best={1: distinct(Candidate, stage=1)},
         history=[distinct(Iteration) for _ in range(3)],
         first=distinct(Candidate),
         last=distinct(Candidate),
@@ -93,13 +89,13 @@ def run():
 
 
 def test_every_field_of_a_run_comes_back_from_its_file(run, tmp_path):
-    drawing = {2: np.array([True, False, True])}
-    runfile.write(tmp_path / "run.h5", run, {"start": 0.25, "a": [1.0, None]}, drawing)
+    baseline = {2: np.array([True, False, True])}
+    runfile.write(tmp_path / "run.h5", run, {"start": 0.25, "a": [1.0, None]}, baseline)
     back = runfile.read_run(tmp_path / "run.h5")
     for field in dataclasses.fields(Optimisation):
         assert same(getattr(back.run, field.name), getattr(run, field.name)), field.name
     assert same(back.summary, {"start": 0.25, "a": [1.0, None]})
-    assert same(back.drawing, drawing)
+    assert same(back.baseline, baseline)
 
 
 def test_every_number_of_an_evaluation_is_a_column_of_the_history(run, tmp_path):
@@ -111,7 +107,7 @@ def test_every_number_of_an_evaluation_is_a_column_of_the_history(run, tmp_path)
 def test_a_run_that_has_nothing_yet_comes_back_too(tmp_path):
     scene = small_scene()
     stage = Stage(1.0, 1e-2, 1e-3, 4e-3)
-    run = begin(scene, Settings((stage,)), [Problem(scene).join(0.1, 1.0, 0.2, 0.3)])
+    run = begin(scene, Settings((stage,)), Problem(scene).join(0.1, 1.0, 0.2, 0.3))
     runfile.write(tmp_path / "run.h5", run)
     assert same(runfile.read_run(tmp_path / "run.h5").run, run)
 

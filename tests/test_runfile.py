@@ -55,8 +55,7 @@ def test_a_run_is_read_back_as_it_was(run, path):
 
 def test_a_halved_time_step_is_remembered(run, tmp_path):
     best = {0: dataclasses.replace(run.best[0], time_step=2e-3)}
-    legs = [dataclasses.replace(run.legs[0], best=best)]
-    runfile.write(tmp_path / "run.h5", dataclasses.replace(run, legs=legs))
+    runfile.write(tmp_path / "run.h5", dataclasses.replace(run, best=best))
     assert runfile.read_run(tmp_path / "run.h5").run.problem().scene.time_step == 2e-3
 
 
@@ -71,8 +70,7 @@ def test_the_best_design_is_there_by_name(run, path):
 
 def test_an_unfinished_run_can_be_read(run, tmp_path):
     path = tmp_path / "run.h5"
-    legs = [dataclasses.replace(run.legs[0], best={})]
-    stopped = dataclasses.replace(run, history=run.history[:1], legs=legs, stop_reason="")
+    stopped = dataclasses.replace(run, history=run.history[:1], best={}, stop_reason="")
     runfile.write(path, stopped)
     back = runfile.read_run(path).run
     assert back.best == {}
@@ -106,15 +104,15 @@ def damaged(path, change, seal=True):
         lambda f: f.attrs.update(settings='{"stages": []}'),
         lambda f: f.attrs.update(settings='{"stages": [], "speed": 3}'),
         lambda f: f.attrs.update(settings=f.attrs["settings"].replace("0.5", '"x"')),
-        lambda f: f.move("legs/0/stages/1", "legs/0/stages/7"),
+        lambda f: f.move("stages/1", "stages/7"),
         lambda f: (f["history"].pop("beta"), f.create_dataset("history/beta", data=[1.0])),
         lambda f: f.attrs.pop("settings"),
         lambda f: f.pop("history/objective"),
-        lambda f: f.create_group("legs/0/stages/x"),
-        lambda f: f["legs/0/stages/0"].pop("x"),
+        lambda f: f.create_group("stages/x"),
+        lambda f: f["stages/0"].pop("x"),
         lambda f: (
-            f["legs/0/stages/0"].pop("x"),
-            f.create_dataset("legs/0/stages/0/x", data=["a"]),
+            f["stages/0"].pop("x"),
+            f.create_dataset("stages/0/x", data=["a"]),
         ),
         lambda f: (f["history"].pop("beta"), f.create_dataset("history/beta", data=[[1.0]])),
     ],
@@ -127,7 +125,7 @@ def test_a_damaged_run_file_is_refused(path, change):
 @pytest.mark.parametrize(
     "change",
     [
-        lambda f: f["legs/0/stages/0/x"].write_direct(np.nextafter(f["legs/0/stages/0/x"][:], 2.0)),
+        lambda f: f["stages/0/x"].write_direct(np.nextafter(f["stages/0/x"][:], 2.0)),
         lambda f: f.attrs.update(stop_reason="other"),
         lambda f: f["last"].attrs.update(objective=9.0),
         lambda f: f.pop("best"),
@@ -178,7 +176,7 @@ def virtual(file):
     [
         (linked("last/x", h5py.SoftLink("/first/x")), "/last/x leads elsewhere: SoftLink"),
         (linked("last", h5py.ExternalLink("o.h5", "/")), "/last leads elsewhere: ExternalLink"),
-        (lambda f: f.update({"last/again": f["legs"]}), "has another name too"),
+        (lambda f: f.update({"last/again": f["stages"]}), "has another name too"),
         (replaced("last/x", (3,), h5py.ref_dtype), "/last/x holds neither numbers nor text"),
         (replaced("last/x", (3,), h5py.vlen_dtype(float)), "neither numbers nor text"),
         (replaced("last/x", data=np.zeros(3, [("a", "f8")])), "neither numbers nor text"),
@@ -187,12 +185,12 @@ def virtual(file):
         (replaced("last/x", (3,), "f8", external=[("/etc/passwd", 0, 24)]), "in another file"),
         (virtual, "not stored in one piece"),
         (lambda f: f.attrs.update(scene=np.zeros(9)), "attribute scene of / is neither"),
-        (lambda f: f.attrs.create("leg", f.ref, dtype=h5py.ref_dtype), "attribute leg of / is"),
+        (lambda f: f.attrs.create("stage", f.ref, dtype=h5py.ref_dtype), "attribute stage of / is"),
         (lambda f: f.attrs.update(settings=100000 * "["), "recursion"),
         (
             lambda f: (
                 f.create_group("stage").attrs.update(time_step=1.0, failures=0),
-                f["stage"].update({"values": [], "gradient": [1.0], "farthest_gradient": []}),
+                f["stage"].update({"values": [], "gradient": [1.0], "incumbent_gradient": []}),
                 f["stage"].create_group("mma"),
             ),
             "do not fit together",
@@ -288,7 +286,7 @@ def test_verify_of_no_run_file_says_so_and_fails(tmp_path):
 
 
 @pytest.mark.process
-def test_postprocess_prints_the_share_of_the_gain_kept(run, path):
+def test_postprocess_prints_the_share_of_the_retained_gain(run, path):
     done = command("postprocess", path, "--threshold", "0.4")
     assert done.returncode == 0, done.stderr
     assert f"optimised                {run.result.objective:.4f}" in done.stdout
@@ -296,7 +294,7 @@ def test_postprocess_prints_the_share_of_the_gain_kept(run, path):
     value = post_processed(problem, run.result.x, 0.4)
     assert f"post-processed           {value:.4f}  (gamma >= 0.4" in done.stdout
     assert f"{(problem.gamma(run.result.x) >= 0.4).sum()} of 32" in done.stdout
-    assert "share of the gain kept" in done.stdout
+    assert "share of the gain retained" in done.stdout
     assert "hanging on nothing" in done.stdout
 
 

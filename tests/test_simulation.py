@@ -16,7 +16,7 @@ from mpmopt.simulation.simulation import Simulation
 def simulation(scene, state=None, **material):
     particles = discretise(scene)
     ones = np.ones(len(particles.position))
-    material = {"density": ones, "lame_lambda": 10 * ones, "lame_mu": 10 * ones, **material}
+    material = {"density": ones, "stiffness": ones, **material}
     signal = np.zeros((scene.steps, len(scene.actuators)))
     return Simulation(scene, particles, **{"signal": signal, **material}, state=state)
 
@@ -60,8 +60,8 @@ def test_a_body_that_spreads_finds_room(scene):
     state = run.initial.copy()
     centre = state[0:2].mean(axis=1, keepdims=True)
     state[2:4] = 8.0 * (state[0:2] - centre)
-    weak = np.full(state.shape[1], 1e-9)
-    frames = simulation(free, state, lame_lambda=weak, lame_mu=weak).run([0, 40])
+    weak = np.full(state.shape[1], 1e-10)
+    frames = simulation(free, state, stiffness=weak).run([0, 40])
     spread = [np.ptp(frame[0]) for frame in frames]
     assert spread[1] >= 2.0 * spread[0]
 
@@ -107,7 +107,7 @@ def test_what_becomes_infinite_ends_the_run_by_name(scene):
     [
         ({"density": np.ones(3)}, r"\(3,\), must have \(48,\)"),
         ({"density": np.zeros(48)}, "must be above 0"),
-        ({"lame_mu": np.full(48, np.nan)}, "lame_mu holds 48 values not finite"),
+        ({"stiffness": np.full(48, np.nan)}, "stiffness holds 48 values not finite"),
         ({"signal": np.zeros((40, 1))}, r"\(40, 1\), must have \(40, 2\)"),
         ({"state": np.zeros((12, 47))}, r"\(12, 47\), must have \(12, 48\)"),
     ],
@@ -120,9 +120,7 @@ def test_arrays_that_do_not_fit_are_refused(scene, change, says):
 def test_a_body_without_particles_is_refused(scene):
     nothing = discretise(scene).subset(np.zeros(48, dtype=bool))
     with pytest.raises(DesignError, match="no particles"):
-        Simulation(
-            scene, nothing, np.zeros(0), np.zeros(0), np.zeros(0), np.zeros((scene.steps, 2))
-        )
+        Simulation(scene, nothing, np.zeros(0), np.zeros(0), np.zeros((scene.steps, 2)))
 
 
 def test_blocks_visit_hardly_more_nodes_than_the_whole_body():

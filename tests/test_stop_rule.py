@@ -112,14 +112,14 @@ def test_a_failure_goes_back_to_the_farthest_design_and_forgets_the_asymptotes(t
 
     settings = dataclasses.replace(counted(values), stages=(stage,))
     run, designs = told(values, settings, gradient)
-    farthest = designs[4]
+    incumbent = designs[4]
     for k in (8, 10, 11):
         fresh = MovingAsymptotes(
-            *(sign * np.ones(farthest.x.size) for sign in (-1.0, 1.0)),
+            *(sign * np.ones(incumbent.x.size) for sign in (-1.0, 1.0)),
             move_limit=designs[k - 1].move_limit / 2.0,
             asymptote_initial=0.5 / 33.0,
         )
-        expected = fresh.step(farthest.x, -9.0, -gradient(farthest.x))
+        expected = fresh.step(incumbent.x, -9.0, -gradient(incumbent.x))
         assert np.array_equal(designs[k].x, expected)
         assert run.history[k].move_limit == designs[k - 1].move_limit / 2.0
 
@@ -147,7 +147,7 @@ def test_only_failures_in_a_row_give_up(told):
     run, _ = told(values, settings)
     assert len(run.history) == len(values)
     assert "gave up after 3 failed evaluations in a row" in run.stop_reason
-    assert run.legs[0].gave_up
+    assert run.gave_up
     assert run.stop_reason.startswith("Stage 1 of 1 was the last: ")
     assert run.first.objective == 0.0
 
@@ -211,7 +211,7 @@ def test_the_next_stage_begins_with_its_own_move_limit_and_no_memory(told):
     run, designs = told([5.0, 4.0, 3.0, 1.0, 2.0, 3.0], settings)
     moves = [item.move_limit for item in run.history]
     assert moves == pytest.approx([0.05, 0.05, 0.03, 0.02, 0.02, 0.02], rel=1e-12)
-    assert np.array_equal(designs[3].x, designs[0].x)  # the farthest of the first
+    assert np.array_equal(designs[3].x, designs[0].x)  # the incumbent of the first
     assert [run.best[0].objective, run.best[1].objective] == [5.0, 3.0]
 
 
@@ -250,34 +250,6 @@ def test_greyness_in_the_history_is_that_of_the_design(told):
         )
 
 
-def test_starts_are_compared_by_the_last_stage_they_scouted(told):
-    # The first start is the better one in the first stage, the second in the second.
-    settings = dataclasses.replace(
-        COUNTED, stages=(STAGE, STAGE, STAGE), most_iterations=2, scouting=2
-    )
-    problem = Problem(small_scene())
-    starts = [problem.join(0.0, a, -0.3, -0.5) for a in (0.5, 0.6)]
-    values = [8.0, 9.0, 1.0, 2.0, 4.0, 5.0, 2.0, 3.0, 4.0, 6.0]
-    run, _ = told(values, settings, starts=starts)
-    assert [(item.start, item.stage) for item in run.history[::2]] == [
-        (0, 0), (0, 1), (1, 0), (1, 1), (1, 2),
-    ]  # fmt: skip
-    assert run.result.start == 1
-    assert {stage: item.objective for stage, item in run.best.items()} == {0: 5.0, 1: 3.0, 2: 6.0}
-
-
-def test_starts_are_compared_without_void_where_the_stage_judges_so(told, monkeypatch):
-    without_void = iter((0.1, 0.2, 0.5, 0.4, 0.1, 0.1))
-    monkeypatch.setattr("mpmopt.optimisation.loop.post_processed", lambda *_: next(without_void))
-    solid = dataclasses.replace(STAGE, solid=True)
-    settings = dataclasses.replace(COUNTED, stages=(solid, solid), most_iterations=2, scouting=1)
-    problem = Problem(small_scene())
-    starts = [problem.join(0.0, a, -0.3, -0.5) for a in (0.5, 0.6)]
-    run, _ = told([8.0, 9.0, 2.0, 3.0, 4.0, 6.0], settings, starts=starts)
-    assert run.legs[1].best[0].post_processed == 0.5  # though not the farthest as it is
-    assert run.leg == 1
-
-
 def test_the_result_is_of_the_sharpest_stage_or_counts_most_without_void(told, monkeypatch):
     settings = dataclasses.replace(COUNTED, stages=(STAGE, STAGE), most_iterations=2)
     run, _ = told([8.0, 9.0, 2.0, 3.0], settings)
@@ -299,21 +271,21 @@ def test_bodies_without_void_are_judged_in_the_step_of_their_evaluation(told, mo
 
     monkeypatch.setattr("mpmopt.optimisation.loop.post_processed", judged)
     monkeypatch.setattr("mpmopt.assess.refinement.least", judged)
-    stage = dataclasses.replace(STAGE, solid=True, audited=True)
+    stage = dataclasses.replace(STAGE, solid=True, refined=True)
     settings = dataclasses.replace(COUNTED, stages=(stage,), most_iterations=1)
     run, _ = told([1.0], settings, halved=2)
     assert asked == [1e-3, 1e-3]
     assert run.result.time_step == 1e-3
 
 
-def test_a_design_that_no_audit_saw_is_no_best_however_far_it_goes(told, monkeypatch):
-    # It counts no more than the best, so that it is not audited.
+def test_a_design_that_no_refinement_saw_is_no_best_however_far_it_goes(told, monkeypatch):
+    # It counts no more than the best, so that it is not refined.
     monkeypatch.setattr("mpmopt.optimisation.loop.post_processed", lambda *_: 0.3)
     monkeypatch.setattr("mpmopt.assess.refinement.least", lambda *_: 0.35)
-    stage = dataclasses.replace(STAGE, solid=True, audited=True)
+    stage = dataclasses.replace(STAGE, solid=True, refined=True)
     settings = dataclasses.replace(COUNTED, stages=(stage,), most_iterations=2)
     run, _ = told([1.0, 2.0], settings)
-    assert np.isnan(run.history[1].audited)
+    assert np.isnan(run.history[1].refined)
     assert run.result.objective == 1.0
 
 

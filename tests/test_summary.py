@@ -11,11 +11,11 @@ from mpmopt.app import case, summary
 from mpmopt.app.case import Case
 from mpmopt.app.summary import summarise
 from mpmopt.assess import refinement, threshold
-from mpmopt.assess.refinement import Audited
+from mpmopt.assess.refinement import Variant
 from mpmopt.design.problem import Problem
 from mpmopt.errors import SimulationError
 from mpmopt.optimisation import presets
-from mpmopt.optimisation.history import Candidate, Leg, Optimisation
+from mpmopt.optimisation.history import Candidate, Optimisation
 from mpmopt.optimisation.settings import Settings
 
 SCENE = small_scene()
@@ -27,7 +27,7 @@ NAMES = ("as designed", "half the step", "twice the step", "cells half as wide")
 def candidate(phi, a, **changes):
     x = PROBLEM.join(phi, a, -0.3, -0.5)
     values = {
-        "start": 0, "stage": 0, "beta": 4.0, "time_step": 4e-3, "move_limit": 0.1,
+        "stage": 0, "beta": 4.0, "time_step": 4e-3, "move_limit": 0.1,
         "objective": 0.5, "non_discreteness": 0.25, "projected_gradient": 0.0, "step": 0.0,
         "seconds": 7.0,
     }  # fmt: skip
@@ -38,19 +38,21 @@ def finished(best_phi=1.0):
     """A run that began with a = 1 and ended with a = 0.75."""
     first, best = candidate(0.0, 1.0, objective=0.1), candidate(best_phi, 0.75)
     history = [first, dataclasses.replace(first, failure="torn"), dataclasses.replace(best)]
-    legs = [Leg(0, first.x, best={0: best})]
-    return Optimisation(SCENE, SHORT, legs, 0, history, first, best, None, "It ended.")
+    return Optimisation(
+        SCENE, SHORT, first.x, best={0: best}, history=history, first=first, last=best,
+        stop_reason="It ended.",
+    )  # fmt: skip
 
 
 @pytest.fixture
 def told(monkeypatch):
     """Lets simulations of solid bodies be these numbers; what references were asked with."""
     asked: list[Any] = []
-    rows: list[Audited] = []
+    rows: list[Variant] = []
     block = [0.3]
 
-    def farthest(scene, drawing, *actuations):
-        keep = drawing(np.zeros((32, 2)))
+    def best_actuated(scene, baseline, *actuations):
+        keep = baseline(np.zeros((32, 2)))
         asked.append((int(np.sum(keep)), [float(v.a[0]) for v in actuations]))
         if not np.all(keep):
             return 0.2
@@ -58,21 +60,21 @@ def told(monkeypatch):
             raise SimulationError("made to fail", 3, 1, (0.0, 0.0), "none")
         return block[0]
 
-    monkeypatch.setattr(summary, "farthest", farthest)
-    monkeypatch.setattr(summary, "audit", lambda problem, x: rows)
+    monkeypatch.setattr(summary, "best_actuated", best_actuated)
+    monkeypatch.setattr(summary, "study", lambda problem, x: rows)
     monkeypatch.setattr(summary, "post_processed", lambda problem, x: 0.45)
     monkeypatch.setattr(summary, "unactuated", lambda problem, x: 0.05)
 
     def tell(references, distances, of_block=0.3):
         block[0] = of_block
         numbers = zip(NAMES, zip(references, distances))
-        rows[:] = [Audited(name, (16, 16), 4e-3, r, d, kept=0.9) for name, (r, d) in numbers]
+        rows[:] = [Variant(name, (16, 16), 4e-3, r, d, retained=0.9) for name, (r, d) in numbers]
         return asked
 
     return tell
 
 
-def test_a_gain_is_over_the_full_block_where_that_goes_farthest(told):
+def test_a_gain_is_over_the_solid_reference_design_where_that_goes_farthest(told):
     # The block's best is 0.3; in the rows it goes 0.1, 0.4, not at all, and 0.3.
     told((0.1, 0.4, np.nan, 0.3), (0.5, 0.5, 0.5, np.nan))
     gain = summarise(finished(), {})["gain"]
@@ -88,11 +90,11 @@ def test_a_gain_is_over_the_full_block_where_that_goes_farthest(told):
 
 def test_references_take_the_better_of_the_first_and_the_best_actuation(told):
     asked = told((0.1,) * 4, (0.5,) * 4)
-    drawing = {1: np.arange(32) < 20, 2: np.zeros(8, dtype=bool)}
-    summary = summarise(finished(), drawing)
+    baseline = {1: np.arange(32) < 20, 2: np.zeros(8, dtype=bool)}
+    summary = summarise(finished(), baseline)
     assert asked == [(32, [1.0, 0.75]), (20, [1.0, 0.75])]
-    assert (summary["reference"], summary["reference_drawn"]) == (0.3, 0.2)
-    assert summarise(finished(), {})["reference_drawn"] is None
+    assert (summary["reference"], summary["baseline"]) == (0.3, 0.2)
+    assert summarise(finished(), {})["baseline"] is None
 
 
 def test_a_summary_is_of_the_best_design_and_counts_all_evaluations(told):
@@ -105,7 +107,7 @@ def test_a_summary_is_of_the_best_design_and_counts_all_evaluations(told):
         "halved_evaluations": 0, "seconds": 7.0, "stop_reason": "It ended.",
     }  # fmt: skip
     assert {name: summary[name] for name in wanted} == wanted
-    assert summary["gain_kept"] == {name: 0.9 for name in NAMES[1:]}
+    assert summary["retained_gain"] == {name: 0.9 for name in NAMES[1:]}
 
 
 def test_loose_particles_are_those_that_hang_on_nothing(told):
@@ -119,27 +121,18 @@ def test_loose_particles_are_those_that_hang_on_nothing(told):
     assert summarise(finished(-1.0), {})["disconnected_particles"] == 0
 
 
-def test_scouts_start_a_quarter_turn_apart(tmp_path, monkeypatch):
-    monkeypatch.setattr(case, "_go_on", lambda path, kept, checkpointing: kept.run.legs)
-    settings = dataclasses.replace(SHORT, scouting=1)
+def test_a_case_starts_where_it_says(tmp_path, monkeypatch):
+    monkeypatch.setattr(case, "_go_on", lambda path, kept, checkpointing: kept.run.x)
     start = {"theta": (0.9, -0.75), "a": 0.5, "b": 0.25}
-    study = Case(SCENE, settings, lambda position: position[:, 0] > 0.0, start)
-    legs: Any = case.run(study, tmp_path / "scouts")
-    designs = [PROBLEM.split(leg.x) for leg in legs]
-    assert [design.theta.tolist() for design in designs] == pytest.approx(
-        np.array([(0.9, -0.75), (-0.6, -0.25), (-0.1, 0.25), (0.4, 0.75)])
-    )
-    assert {(*design.a, *design.b, *design.phi) for design in designs} == {
-        (0.5, 0.5, 0.25, 0.25, *32 * (0.0,))
-    }
-    one = dataclasses.replace(study, settings=SHORT)
-    legs = case.run(one, tmp_path / "one")
-    (leg,) = legs
-    assert PROBLEM.split(leg.x).theta.tolist() == [0.9, -0.75]
+    study = Case(SCENE, SHORT, lambda position: position[:, 0] > 0.0, start)
+    x: Any = case.run(study, tmp_path / "one")
+    found = PROBLEM.split(x)
+    assert found.theta.tolist() == [0.9, -0.75]
+    assert {(*found.a, *found.b, *found.phi)} == {(0.5, 0.5, 0.25, 0.25, *32 * (0.0,))}
 
 
-def test_a_drawing_is_kept_for_each_coarsening_of_the_stages(tmp_path, monkeypatch):
-    monkeypatch.setattr(case, "_go_on", lambda path, kept, checkpointing: kept.drawing)
+def test_a_baseline_is_kept_for_each_coarsening_of_the_stages(tmp_path, monkeypatch):
+    monkeypatch.setattr(case, "_go_on", lambda path, kept, checkpointing: kept.baseline)
     stages = (dataclasses.replace(STAGE, coarsening=2, time_step=4e-3, solid=False), STAGE)
     twice = [
         {name: tuple(2 * k for k in getattr(part, name)) for name in ("lower", "upper")}
@@ -148,8 +141,8 @@ def test_a_drawing_is_kept_for_each_coarsening_of_the_stages(tmp_path, monkeypat
     body = tuple(dataclasses.replace(part, **two) for part, two in zip(SCENE.body, twice))
     scene = small_scene(body=body, walls=())
     study = Case(scene, Settings(stages), lambda position: position[:, 1] < 10 / 16)
-    drawing: Any = case.run(study, tmp_path)
-    assert {name: (there.size, there.sum()) for name, there in drawing.items()} == {
+    baseline: Any = case.run(study, tmp_path)
+    assert {name: (there.size, there.sum()) for name, there in baseline.items()} == {
         2: (32, 16), 1: (128, 64),
     }  # fmt: skip
 
@@ -159,14 +152,14 @@ def test_a_share_of_the_gain_is_over_the_block_in_the_same_discretisation(monkey
     values = iter((0.1, 0.5, 0.2, 0.4, 0.3, 0.2, 0.0, 0.5))
     monkeypatch.setattr(refinement, "distance", lambda *_: next(values))
     x = PROBLEM.join(1.0, 0.5, 0.0, 0.0)
-    rows = refinement.audit(PROBLEM, x)
-    assert [row.kept for row in rows] == pytest.approx([1.0, 0.5, -0.25, 1.25])
+    rows = refinement.study(PROBLEM, x)
+    assert [row.retained for row in rows] == pytest.approx([1.0, 0.5, -0.25, 1.25])
     for design in (0.5, 0.4):  # no gain, and a loss
         values = iter((0.5, design, 0.2, 0.4, 0.3, 0.2, 0.0, 0.5))
-        assert all(np.isnan(row.kept) for row in refinement.audit(PROBLEM, x))
+        assert all(np.isnan(row.retained) for row in refinement.study(PROBLEM, x))
 
 
-def test_the_least_of_an_audit_is_of_half_the_step_and_half_the_cells(monkeypatch):
+def test_the_least_of_a_refinement_study_is_of_half_the_step_and_half_the_cells(monkeypatch):
     asked = []
 
     def distance(scene, keep, variables, objective):
@@ -183,7 +176,7 @@ def test_the_least_of_an_audit_is_of_half_the_step_and_half_the_cells(monkeypatc
 def test_a_design_on_finer_cells_takes_each_particle_from_the_nearest():
     phi = np.where(PROBLEM.particles.position[PROBLEM.particles.designed][:, 0] < 5 / 16, 1.0, -1.0)
     x = PROBLEM.join(phi, 0.5, 0.0, 0.0)
-    fine = Problem(refinement.refined(SCENE))
+    fine = Problem(refinement.finer(SCENE))
     there = refinement.mapped(fine.scene, PROBLEM, x)
     keep = threshold.kept(PROBLEM, x)
     assert 0 < keep.sum() < keep.size
@@ -241,14 +234,14 @@ def test_a_reference_takes_the_best_actuation_of_those_that_run(monkeypatch):
 
     monkeypatch.setattr(threshold, "distance", distance)
 
-    def farthest(*amplitudes):
+    def best_actuated(*amplitudes):
         actuations = [PROBLEM.split(PROBLEM.join(0.0, a, 0.0, 0.0)) for a in amplitudes]
-        return threshold.farthest(SCENE, threshold.solid_reference, *actuations)
+        return threshold.best_actuated(SCENE, threshold.solid_reference, *actuations)
 
-    assert farthest(0.25, 0.5, 0.75) == 0.3
-    assert farthest(1.0, 0.25) == farthest(0.25, 1.0) == 0.1
+    assert best_actuated(0.25, 0.5, 0.75) == 0.3
+    assert best_actuated(1.0, 0.25) == best_actuated(0.25, 1.0) == 0.1
     with pytest.raises(SimulationError, match="made to fail"):
-        farthest(1.0, 0.0)
+        best_actuated(1.0, 0.0)
 
 
 def test_a_distance_after_a_transient_counts_from_there():
@@ -268,22 +261,22 @@ def test_the_presets_are_what_they_say():
     assert [stage.beta for stage in sharp.stages] == [0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0]
     late = [False] * 4 + [True] * 3
     assert [stage.solid for stage in sharp.stages] == late
-    assert [stage.audited for stage in sharp.stages] == late
+    assert [stage.refined for stage in sharp.stages] == late
     assert [stage.void_cutoff > 0.0 for stage in sharp.stages] == late
     assert (sharp.adapt_move_limit, sharp.sharpen_asymptotes, sharp.best_first) == 3 * (True,)
 
     fine = presets.coarse_to_fine(2e-3, 1e-3)
     coarse, rest = fine.stages[:5], fine.stages[5:]
     assert [stage.beta for stage in coarse] == [0.5, 1.0, 2.0, 4.0, 8.0]
-    assert {(stage.coarsening, stage.time_step, stage.audited) for stage in coarse} == {
+    assert {(stage.coarsening, stage.time_step, stage.refined) for stage in coarse} == {
         (2, 2e-3, False)
     }
     assert [stage.solid for stage in coarse] == 4 * [False] + [True]
     assert [stage.beta for stage in rest] == [8.0, *4 * [16.0], *3 * [32.0]]
-    assert {(stage.coarsening, stage.time_step, stage.audited, stage.solid) for stage in rest} == {
+    assert {(stage.coarsening, stage.time_step, stage.refined, stage.solid) for stage in rest} == {
         (1, 1e-3, True, True)
     }
-    assert (fine.scouting, fine.tolerance) == (3, 0.0)
+    assert fine.tolerance == 0.0
 
     paper = presets.paper_preset(1e-3)
     assert [stage.beta for stage in paper.stages] == [0.5, 1.0, 2.0, 4.0, 8.0, 16.0]

@@ -93,7 +93,7 @@ def body_of(steps=40):
 
     def simulation(state):
         signal = np.zeros((steps, 0))
-        return Simulation(scene, particles, ones, 10 * ones, 10 * ones, signal, state)
+        return Simulation(scene, particles, ones, ones, signal, state)
 
     return simulation, state
 

@@ -19,7 +19,7 @@ from mpmopt.results import runfile
 from mpmopt.scene import Actuator, Grid
 
 # What is a length; the rest has no unit.
-LENGTHS = ("objective", "post_processed", "audited", "projected_gradient")
+LENGTHS = ("objective", "post_processed", "refined", "projected_gradient")
 
 
 def scaled(scene, length, mass, time):
@@ -63,7 +63,7 @@ def optimised(length=1.0, mass=1.0, time=1.0):
     scene = scaled(scene, length, mass, time)
     stages = (
         Stage(0.5, 1e-2, 1e-3, 4e-3 * time),
-        Stage(8.0, 1e-2, 1e-3, 4e-3 * time, solid=True, audited=True, void_cutoff=0.05),
+        Stage(8.0, 1e-2, 1e-3, 4e-3 * time, solid=True, refined=True, void_cutoff=0.05),
     )
     settings = Settings(stages, window=3, tolerance=1e-4, least_iterations=4, most_iterations=40)
     designs = []
@@ -109,8 +109,8 @@ def test_other_units_lead_to_the_same_steps_bit_for_bit(plain, length, mass, tim
     one, two = summarise(one, {}), summarise(other, {})
     for name in ("start", "reference", "optimised", "post_processed", "post_processed_half_step"):
         assert two[name] == (None if one[name] is None else length * one[name])
-    assert [two[name] for name in ("gain_kept", "non_discreteness", "a", "theta", "b")] == [
-        one[name] for name in ("gain_kept", "non_discreteness", "a", "theta", "b")
+    assert [two[name] for name in ("retained_gain", "non_discreteness", "a", "theta", "b")] == [
+        one[name] for name in ("retained_gain", "non_discreteness", "a", "theta", "b")
     ]
     assert one["post_processed_half_step"] is not None
 
@@ -144,7 +144,7 @@ def test_what_is_printed_of_a_small_robot_has_digits(tmp_path, capsys):
     are_told(re.findall(r"best L = (\S+)", repr(kept))[0], 1)
     assert commands.main(["postprocess", str(tmp_path / "run.h5")]) == 0
     are_told("\n".join(line.split("(gamma")[0] for line in capsys.readouterr().out.split("\n")), 3)
-    assert commands.main(["audit", str(tmp_path / "run.h5")]) == 0
+    assert commands.main(["refine", str(tmp_path / "run.h5")]) == 0
     _, *lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 4
     for line in lines:
@@ -153,10 +153,11 @@ def test_what_is_printed_of_a_small_robot_has_digits(tmp_path, capsys):
 
 def test_what_is_printed_of_several_small_starts_has_digits():
     row = {
-        "post_processed": 6.1e-4, "gain": 1.234e-4, "kept_half_step": 1.0, "kept_half_cells": 0.5,
-        "audited_gain": 6e-5, "disconnected_particles": 0, "failed_evaluations": 0, "seconds": 1.0,
+        "post_processed": 6.1e-4, "gain": 1.234e-4, "retained_half_step": 1.0,
+        "retained_half_cells": 0.5,
+        "refined_gain": 6e-5, "disconnected_particles": 0, "failed_evaluations": 0, "seconds": 1.0,
     }  # fmt: skip
-    text = report([{"start": 0, **row}, {"start": 1, **row, "gain": 1.3e-4, "audited_gain": 5e-5}])
+    text = report([{"start": 0, **row}, {"start": 1, **row, "gain": 1.3e-4, "refined_gain": 5e-5}])
     lines = text.splitlines()
     assert len({len(line) for line in lines[:3]}) == 1
     are_told(text, 6 + 8 + 1)

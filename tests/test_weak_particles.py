@@ -17,7 +17,7 @@ STEP = weak_particles.STEP_IN_CELLS / 64
 
 
 @pytest.fixture
-def drawn():
+def baseline():
     """The walker's scene on 64 x 64 cells, a tenth of it in time, and slanted legs."""
     scene = dataclasses.replace(walker.walker(64, STEP), steps=60)
     particles = discretise(scene)
@@ -29,8 +29,8 @@ def test_the_long_step_is_at_courant_one_half_or_more():
         assert 0.5 <= make(128, weak_particles.STEP_IN_CELLS / 128).courant <= 0.6
 
 
-def test_void_that_is_left_out_moves_nothing_and_void_that_is_there_does(drawn):
-    scene, keep = drawn
+def test_void_that_is_left_out_moves_nothing_and_void_that_is_there_does(baseline):
+    scene, keep = baseline
     removed = distance(scene, keep, ACTUATION)
     assert weak_particles.distance_with_void(scene, keep, ACTUATION, Void(1e-2, 0.0)) == removed
     there = weak_particles.distance_with_void(scene, keep, ACTUATION, Void(1e-2))
@@ -42,8 +42,8 @@ def test_void_that_is_left_out_moves_nothing_and_void_that_is_there_does(drawn):
     assert with_void == distance(scene, full, ACTUATION)
 
 
-def test_moved_is_in_percent_of_the_gain_over_the_full_block(drawn, monkeypatch):
-    scene, keep = drawn
+def test_moved_is_in_percent_of_the_gain_over_the_solid_reference_design(baseline, monkeypatch):
+    scene, keep = baseline
     monkeypatch.setattr(
         weak_particles, "distance", lambda _, kept, *rest: 3.0 if kept is keep else 1.0
     )
@@ -53,11 +53,11 @@ def test_moved_is_in_percent_of_the_gain_over_the_full_block(drawn, monkeypatch)
     assert set(weak_particles.moved(scene, keep, ACTUATION)) == {"no gain"}
 
 
-def test_a_failure_is_named_not_numbered(drawn, monkeypatch):
-    scene, keep = drawn
+def test_a_failure_is_named_not_numbered(baseline, monkeypatch):
+    scene, keep = baseline
     short = dataclasses.replace(scene, gravity=(0.0, -3000.0))
     assert set(weak_particles.moved(short, keep, ACTUATION)) == {"fails without void"}
-    # The full block lives, the legs' void does not.
+    # The solid reference design lives, the legs' void does not.
     monkeypatch.setattr(weak_particles, "distance", lambda _, kept, *rest: float(kept is keep))
     found = weak_particles.moved(short, keep, ACTUATION)
     assert found[0].startswith("failed at step ")

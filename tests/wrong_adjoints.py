@@ -48,13 +48,13 @@ FAULTS = {
         "number(bar, at(g, VELOCITY), k)",
     ),
     "inertia of the affine velocity": (
-        "m = load(data.mass, g)\n    add(data_bar.mass",
-        "m = 0.0 * load(data.mass, g)\n    add(data_bar.mass",
+        "m = load(data.mass, g)\n        add(data_bar.mass",
+        "m = 0.0 * load(data.mass, g)\n        add(data_bar.mass",
     ),
-    "pressure": ("t01 * h10 + pressure * f11", "t01 * h10 - pressure * f11"),
+    "pressure": ("t01 * f10) + pressure * f11", "t01 * f10) - pressure * f11"),
     "shear counted once": ("impulse * (a01 + a10)", "impulse * a01"),
-    "lambda": ("trace * load(log_J, g)", "trace"),
-    "actuation in F": ("h00 + f00 * s00 + f01 * s01", "h00 + f00 * s00"),
+    "stiffness": ("t00 * s00 + t01 * s01 + t11 * s11", "t00 * s00 + t11 * s11"),
+    "actuation in F": ("h00, h01 = f00 * s00 + f01 * s01", "h00, h01 = f00 * s00"),
     "signal": ("power + t11 *", "power - t11 *"),
     "C transposed in the deformation": (
         "d01 + dt * (b00 * f10 + b01 * f11)",
@@ -128,8 +128,8 @@ def main() -> None:
             "transient forgotten",
             simulation.Forward,
             "reverse",
-            lambda self, seeds, reverse=simulation.Forward.reverse: reverse(
-                self, {max(seeds): seeds[max(seeds)]}
+            lambda self, terminal_adjoints, reverse=simulation.Forward.reverse: reverse(
+                self, {max(terminal_adjoints): terminal_adjoints[max(terminal_adjoints)]}
             ),
         ),
         (

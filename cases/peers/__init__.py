@@ -35,6 +35,13 @@ def clamped(parameters: Parameters) -> tuple[list[int], list[int]]:
 def constants(simulation: Simulation) -> tuple[NDArray, NDArray, NDArray, NDArray]:
     """Volume, mass, lambda and mu (N,) of the particles."""
     data, count = simulation.data, simulation.initial.shape[1]
-    arrays = (data.volume, data.mass, data.lame_lambda, data.lame_mu)
-    volume, mass, lame_lambda, lame_mu = (ungrouped(array, 1, count)[0] for array in arrays)
-    return volume, mass, lame_lambda, lame_mu
+    arrays = (data.volume, data.mass, data.stiffness, *data.constants[:2])
+    volume, mass, stiffness, lam, mu = (ungrouped(array, 1, count)[0] for array in arrays)
+    return volume, mass, stiffness * lam, stiffness * mu
+
+
+def stiffness_bar(simulation: Simulation, lambda_bar: NDArray, mu_bar: NDArray) -> NDArray:
+    """The adjoint (N,) of the particles' stiffness, from those of lambda and mu."""
+    count = simulation.initial.shape[1]
+    lam, mu = (ungrouped(array, 1, count)[0] for array in simulation.data.constants[:2])
+    return lam * lambda_bar + mu * mu_bar

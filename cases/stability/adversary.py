@@ -110,7 +110,7 @@ def measure(measured: Measured) -> Found:
         program = "SimulationError; the optimiser goes back with half the move limit."
         if of:
             program = (
-                f"Redone with half the step: at Courant {COURANTS[-1]:g} {halved} of {of} are "
+                f"Repeated with half the step: at Courant {COURANTS[-1]:g} {halved} of {of} are "
                 f"halved and {failed} fail (SimulationError)."
             )
         share = ", ".join(

@@ -75,8 +75,7 @@ def solid(
         scene,
         particles,
         material.density * share.get("mass", ones),
-        material.lame_lambda * stiffness,
-        material.lame_mu * stiffness,
+        stiffness,
         np.zeros((scene.steps, len(scene.actuators))) if signal is None else signal,
         state,
     )

@@ -23,7 +23,7 @@ worm = Scene(
 
 
 def all_there(positions):
-    """What a drawn design would be, to compare with: here simply the full block."""
+    """What a drawn design would be, to compare with: here simply the solid reference design."""
     return positions[:, 0] > 0.0
 
 

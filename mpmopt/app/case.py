@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 
 from mpmopt.app.summary import summarise
 from mpmopt.assess.threshold import Baseline
-from mpmopt.design.problem import Problem, Variables
+from mpmopt.design.problem import Problem
 from mpmopt.errors import DesignError, RunFileError, StorageError
 from mpmopt.io.console import say
 from mpmopt.io.files import locked, make_folder, refuse_existing, replace_file
 from mpmopt.io.progress import Progress
 from mpmopt.optimisation.history import Optimisation
-from mpmopt.optimisation.loop import HOW, begin, check_body_fits, go_on
+from mpmopt.optimisation.loop import HOW, begin, go_on
 from mpmopt.optimisation.settings import Settings
 from mpmopt.results import runfile
 from mpmopt.scene import Scene
@@ -33,7 +33,6 @@ logger = logging.getLogger(__name__)
 
 RESULTS = ("summary.json", "design.png", "history.png")  # besides run.h5
 START = {"phi": 0.0, "a": 1.0, "theta": -0.3, "b": -0.5}
-QUARTER_TURNS = (0.0, 0.5, 1.0, -0.5)  # of theta, for the starts that scout
 
 
 @dataclass(frozen=True)
@@ -44,9 +43,9 @@ class Case:
     ----------
     scene : Scene
     settings : Settings
-    drawing : callable
+    baseline : callable
         From positions (D, 2) of the design particles to which are there (D,): a second reference
-        design besides the full block.
+        design besides the solid reference design.
     start : mapping, optional
         First phi, a, theta and b, as `Problem.join` takes them: one number for all actuators, or
         one for each. What is left out is that of `START`.
@@ -59,16 +58,16 @@ class Case:
 
     scene: Scene
     settings: Settings
-    drawing: Baseline
+    baseline: Baseline
     start: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         instance("Case", "scene", self.scene, Scene)
         instance("Case", "settings", self.settings, Settings, HOW)
         instance("Case", "start", self.start, Mapping)
-        if not callable(self.drawing):
+        if not callable(self.baseline):
             raise DesignError(
-                f"Case: drawing = {shown(self.drawing)} must be a function of positions (D, 2), "
+                f"Case: baseline = {shown(self.baseline)} must be a function of positions (D, 2), "
                 "such as binary.solid_reference"
             )
         if unknown := set(self.start) - set(START):
@@ -128,7 +127,7 @@ def run(
     Raises
     ------
     DesignError
-        If the drawing is none (`drawn`); it is looked at before anything is written.
+        If the baseline is none (`baseline_particles`); it is looked at before anything is written.
     StorageError
         If the folder cannot be made, holds another case's run or files of those names without a
         run, or another process is at work in it.
@@ -140,15 +139,12 @@ def run(
     folder = path.parent
     first = case.settings.stages[0]
     problem = Problem(first.scene(case.scene), first.beta, checkpointing)
-    turns = QUARTER_TURNS if case.settings.scouting else (0.0,)
     position = problem.particles.position[problem.particles.designed]
     if phi is not None and not callable(phi):
         raise DesignError(f"run: phi = {shown(phi)} must be a function of positions (D, 2)")
     plain = case.start if phi is None else {**case.start, "phi": phi(position)}
-    parts = Variables.of(problem.join(**plain), len(position))
-    starts = [problem.join(*parts._replace(theta=_turned(parts.theta, turn))) for turn in turns]
-    check_body_fits(case.scene)
-    new, drawing = begin(case.scene, case.settings, starts), drawn(case)
+    start = problem.join(**plain)
+    new, baseline = begin(case.scene, case.settings, start), baseline_particles(case)
     make_folder(folder)
     with locked(path):
         if path.exists() and not force:
@@ -158,16 +154,16 @@ def run(
                 raise RunFileError(
                     f"{error}; choose another folder, or --force to replace it"
                 ) from error
-            begun = kept.run.first.x if kept.run.first else kept.run.legs[0].x
+            begun = kept.run.first.x if kept.run.first else kept.run.x
             same = (kept.run.scene, kept.run.settings) == (case.scene, case.settings)
-            if not same or not np.array_equal(begun, starts[0]):
+            if not same or not np.array_equal(begun, start):
                 raise StorageError(
                     f"{path} holds an earlier run of another case; choose another folder, or "
                     "--force to replace it"
                 )
             return _go_on(path, kept, checkpointing)
         refuse_existing((folder / name for name in RESULTS), force)
-        runfile.write(path, new, drawing=drawing)
+        runfile.write(path, new, baseline=baseline)
         return _go_on(path, runfile.read_run(path), checkpointing)
 
 
@@ -196,8 +192,8 @@ def resume(
         return _go_on(path, runfile.read_run(path), checkpointing)
 
 
-def drawn(case: Case) -> dict[int, NDArray[np.bool_]]:
-    """Which design particles the case's drawing has, for each coarsening of its stages.
+def baseline_particles(case: Case) -> dict[int, NDArray[np.bool_]]:
+    """Which design particles the case's baseline has, for each coarsening of its stages.
 
     Raises
     ------
@@ -208,11 +204,11 @@ def drawn(case: Case) -> dict[int, NDArray[np.bool_]]:
     for coarsening, stage in {stage.coarsening: stage for stage in case.settings.stages}.items():
         particles = discretise(stage.scene(case.scene))
         position = particles.position[particles.designed]
-        array, shape = np.asarray(case.drawing(position), dtype=object), (len(position),)
+        array, shape = np.asarray(case.baseline(position), dtype=object), (len(position),)
         kinds = {type(value).__name__ for value in array.ravel().tolist()}
         if array.shape != shape or not kinds <= {"bool", "bool_"}:
             raise DesignError(
-                f"Case: drawing gave {', '.join(sorted(kinds))} of shape {array.shape} for "
+                f"Case: baseline gave {', '.join(sorted(kinds))} of shape {array.shape} for "
                 f"positions of shape {position.shape}, must give bool of shape {shape}: whether "
                 "each particle is there"
             )
@@ -232,22 +228,16 @@ def _go_on(
         say(f"Going on after {len(kept.run.history)} evaluations.")
 
     def save(current: Optimisation) -> None:
-        runfile.write(path, current, drawing=kept.drawing)
+        runfile.write(path, current, baseline=kept.baseline)
 
     result = go_on(kept.run, [save, ProgressBar()], checkpointing)
-    summary = summarise(result, kept.drawing)
+    summary = summarise(result, kept.baseline)
     text = json.dumps(summary, indent=1) + "\n"
     replace_file(path.parent / "summary.json", text.encode())
-    runfile.write(path, result, summary, kept.drawing)
+    runfile.write(path, result, summary, kept.baseline)
     for name in RESULTS[1:]:
         draw_or_warn(path.parent / name, lambda picture: _draw(picture, result))
     return summary
-
-
-def _turned(theta: NDArray[np.float64], turn: float) -> NDArray[np.float64]:
-    """Theta and a turn, within [-1, 1]."""
-    theta = theta + turn
-    return np.where(np.abs(theta) > 1.0, theta - 2.0 * np.sign(theta), theta)
 
 
 def _draw(path: Path, result: Optimisation) -> None:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mpmopt.app.case import RESULTS, Case, draw_or_warn, drawn, run
+from mpmopt.app.case import RESULTS, Case, baseline_particles, draw_or_warn, run
 from mpmopt.app.sweeps import as_csv, connected, sweep
 from mpmopt.assess.threshold import Baseline
 from mpmopt.errors import RunFileError, SweepError
@@ -70,7 +70,7 @@ def one_start(
     start: dict[str, Any],
     seed: int,
     *,
-    drawing: Baseline,
+    baseline: Baseline,
     out: Path,
 ) -> dict[str, float]:
     """Optimise from one start, in a folder of its own, or go on with what was begun there.
@@ -80,10 +80,11 @@ def one_start(
     Returns
     -------
     dict
-        Numbers of the summary; `gain` is the post-processed design's over the full block, and
-        `audited_gain` the least of it as designed, with half the step, and with cells half as wide.
+        Numbers of the summary; `gain` is the post-processed design's over the solid reference
+        design, and `refined_gain` the least of it as designed, with half the step, and with cells
+        half as wide.
     """
-    case = Case(Scene.from_json(scene), Settings.from_dict(settings), drawing, start)
+    case = Case(Scene.from_json(scene), Settings.from_dict(settings), baseline, start)
     folder = out / f"start-{seed}"
     folder.mkdir(parents=True, exist_ok=True)
     # Paths may hold what is no text.
@@ -95,16 +96,16 @@ def one_start(
         return math.nan if value is None else float(value)
 
     gains = {name: number(value) for name, value in summary["gain"].items()}
-    kept = summary["gain_kept"]
+    retained = summary["retained_gain"]
     honest = ("as designed", "half the step", "cells half as wide")
     return {
         "reference": number(summary["reference"]),
         "optimised": summary["optimised"],
         "post_processed": number(summary["post_processed"]),
         "gain": gains["as designed"],
-        "kept_half_step": number(kept["half the step"]),
-        "kept_half_cells": number(kept["cells half as wide"]),
-        "audited_gain": float(np.min([gains[name] for name in honest])),
+        "retained_half_step": number(retained["half the step"]),
+        "retained_half_cells": number(retained["cells half as wide"]),
+        "refined_gain": float(np.min([gains[name] for name in honest])),
         "disconnected_particles": summary["disconnected_particles"],
         "evaluations": summary["evaluations"],
         "failed_evaluations": summary["failed_evaluations"],
@@ -140,7 +141,7 @@ def multistart(
     Returns
     -------
     str
-        The table, what spread there is, and the best after its audit.
+        The table, what spread there is, and the best after its refinement study.
 
     Raises
     ------
@@ -154,7 +155,7 @@ def multistart(
     starts = count("multistart", "starts", starts, 1, error=SweepError)
     out = place("multistart", "out", out).absolute()
     check_body_fits(case.scene)
-    drawn(case)  # what is wrong with it is told now, not by every start
+    baseline_particles(case)  # what is wrong with it is told now, not by every start
     make_folder(out)
     table, picture = out / "starts.csv", out / "starts.png"
     if not (out / "starts.h5").exists():
@@ -164,7 +165,7 @@ def multistart(
         "settings": dataclasses.asdict(case.settings),
         "start": {name: np.asarray(value).tolist() for name, value in case.start.items()},
     }
-    function = functools.partial(one_start, drawing=case.drawing, out=out)
+    function = functools.partial(one_start, baseline=case.baseline, out=out)
     with connected(scheduler) as executor:
         if force:
             _clear(out, [out / f"start-{seed}" for seed in range(starts)])
@@ -206,13 +207,13 @@ def _clear(out: Path, folders: Sequence[Path]) -> None:
 
 
 def best_of(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """The row with the greatest audited gain; one that has none comes last."""
+    """The row with the greatest refined gain; one that has none comes last."""
     return max(rows, key=_rank)
 
 
 def _rank(row: dict[str, Any]) -> tuple[float, float]:
-    audited, gain = (np.nan_to_num(row[name], nan=-np.inf) for name in ("audited_gain", "gain"))
-    return audited, gain
+    refined, gain = (np.nan_to_num(row[name], nan=-np.inf) for name in ("refined_gain", "gain"))
+    return refined, gain
 
 
 def report(rows: Sequence[dict[str, Any]]) -> str:
@@ -221,9 +222,9 @@ def report(rows: Sequence[dict[str, Any]]) -> str:
         "start": ("start", str),
         "post_processed": ("post-processed", _length),
         "gain": ("     gain", _length),
-        "kept_half_step": ("kept at half step", "{:.0%}".format),
-        "kept_half_cells": ("at half cells", "{:.0%}".format),
-        "audited_gain": ("audited gain", _length),
+        "retained_half_step": ("retained at half step", "{:.0%}".format),
+        "retained_half_cells": ("at half cells", "{:.0%}".format),
+        "refined_gain": ("refined gain", _length),
         "disconnected_particles": ("loose", str),
         "failed_evaluations": ("failed", str),
         "seconds": ("seconds", "{:.0f}".format),
@@ -235,7 +236,7 @@ def report(rows: Sequence[dict[str, Any]]) -> str:
             for name, (head, form) in columns.items()
         )
         lines.append("  ".join(cells))
-    for name in ("gain", "audited_gain"):
+    for name in ("gain", "refined_gain"):
         values = [row[name] for row in rows if math.isfinite(row[name])]
         if values:
             low, middle, high = np.percentile(values, (0, 50, 100))
@@ -244,9 +245,9 @@ def report(rows: Sequence[dict[str, Any]]) -> str:
                 f"{_length(middle)}, standard deviation {_length(float(np.std(values)))}"
             )
     best = best_of(rows)
-    gain = best["audited_gain"]
-    found = f"gain {_length(gain)}" if math.isfinite(gain) else "which has no audited gain"
-    lines.append(f"best after its audit: start-{best['start']}, {found}")
+    gain = best["refined_gain"]
+    found = f"gain {_length(gain)}" if math.isfinite(gain) else "which has no refined gain"
+    lines.append(f"best after its refinement study: start-{best['start']}, {found}")
     return "\n".join(lines)
 
 
@@ -274,32 +275,32 @@ def _draw(path: Path, out: Path, rows: Sequence[dict[str, Any]]) -> None:
     upper, lower = parts
     axes = upper.subplots()
     start = [row["start"] for row in rows]
-    gain, audited = ([row[name] for row in rows] for name in ("gain", "audited_gain"))
-    axes.vlines(start, audited, gain, color="0.7", lw=2, zorder=1)
+    gain, refined = ([row[name] for row in rows] for name in ("gain", "refined_gain"))
+    axes.vlines(start, refined, gain, color="0.7", lw=2, zorder=1)
     axes.plot(start, gain, "o", color="C0", label="post-processed")
-    axes.plot(start, audited, "s", color="C1", label="after the audit")
+    axes.plot(start, refined, "s", color="C1", label="after the refinement study")
     axes.axhline(np.nanmedian(gain), color="C0", ls=":", lw=1, label="median")
-    if np.isfinite(audited).any():
-        axes.axhline(np.nanmedian(audited), color="C1", ls=":", lw=1)
+    if np.isfinite(refined).any():
+        axes.axhline(np.nanmedian(refined), color="C1", ls=":", lw=1)
     best = ranked[0]
     axes.plot(
-        best["start"], best["audited_gain"], "s", ms=13, mfc="none", mec="crimson", mew=1.5,
+        best["start"], best["refined_gain"], "s", ms=13, mfc="none", mec="crimson", mew=1.5,
         label="best",
     )  # fmt: skip
     axes.axhline(0.0, color="black", lw=0.8)
     axes.set_xticks(start)
     axes.set_xlabel("start (0: plain)")
-    axes.set_ylabel("gain over the full block")
+    axes.set_ylabel("gain over the solid reference design")
     axes.legend(fontsize=8, ncols=4, loc="lower center", bbox_to_anchor=(0.5, 1.0), frameon=False)
     axes.grid(True, axis="y", alpha=0.3)
-    form = format_of([row["audited_gain"] for row in shown])
+    form = format_of([row["refined_gain"] for row in shown])
     for axis, row in zip(lower.subplots(lines, 4, squeeze=False).flat, shown):
         try:
             kept = runfile.read_run(out / f"start-{row['start']}" / "run.h5").run
             draw_design(axis, kept.problem(), kept.result.x)
         except RunFileError as error:
             logger.warning("no picture of start %d's design: %s", row["start"], error)
-        axis.set_title(f"start {row['start']}: {row['audited_gain']:{form}}", fontsize=9)
+        axis.set_title(f"start {row['start']}: {row['refined_gain']:{form}}", fontsize=9)
     for axis in lower.axes:
         axis.set_axis_off()
     replace_file(path, png(figure))

@@ -10,8 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpmopt.assess import threshold
-from mpmopt.assess.refinement import audit
-from mpmopt.assess.threshold import farthest, pieces, post_processed, solid_reference, unactuated
+from mpmopt.assess.refinement import study
+from mpmopt.assess.threshold import (
+    best_actuated,
+    pieces,
+    post_processed,
+    solid_reference,
+    unactuated,
+)
 from mpmopt.design.problem import Variables
 from mpmopt.errors import SimulationError
 from mpmopt.optimisation.history import Optimisation
@@ -20,22 +26,22 @@ from mpmopt.validation import digits, instance
 logger = logging.getLogger(__name__)
 
 
-def summarise(result: Optimisation, drawing: Mapping[int, NDArray[np.bool_]]) -> dict[str, Any]:
+def summarise(result: Optimisation, baseline: Mapping[int, NDArray[np.bool_]]) -> dict[str, Any]:
     """Objective values (L, larger is farther), actuation and counts of a finished optimisation.
 
-    The drawing is that of `drawn`, or empty.
+    The baseline is that of `baseline_particles`, or empty.
 
     Reference designs count with the better of the first and the best design's actuation.
     """
     instance("summarise", "result", result, Optimisation)
     best, problem = result.result, result.problem()
-    _, *others = audits = audit(problem, best.x)
+    _, *others = rows = study(problem, best.x)
     first = result.first
     assert first is not None
-    there = drawing.get(result.settings.stages[best.stage].coarsening)
+    there = baseline.get(result.settings.stages[best.stage].coarsening)
     actuations = [Variables.of(item.x, item.gamma.size) for item in (first, best)]
     actuation = actuations[1]
-    reference = _value_or_none(lambda: farthest(problem.scene, solid_reference, *actuations))
+    reference = _value_or_none(lambda: best_actuated(problem.scene, solid_reference, *actuations))
     block = np.nan if reference is None else reference
 
     def numbers(values: np.ndarray) -> float | list[float]:
@@ -44,26 +50,26 @@ def summarise(result: Optimisation, drawing: Mapping[int, NDArray[np.bool_]]) ->
     return {
         "start": _value_or_none(lambda: first.objective),
         "reference": reference,
-        "reference_drawn": None
+        "baseline": None
         if there is None
-        else _value_or_none(lambda: farthest(problem.scene, lambda _: there, *actuations)),
+        else _value_or_none(lambda: best_actuated(problem.scene, lambda _: there, *actuations)),
         "optimised": best.objective,
         "post_processed": _value_or_none(lambda: post_processed(problem, best.x)),
         "actuation_off": _value_or_none(lambda: unactuated(problem, best.x)),
         "disconnected_particles": int(
             (pieces(problem.scene, threshold.kept(problem, best.x)) > 0).sum()
         ),
-        "post_processed_half_step": _number_or_none(audits[1].distance),
-        # Over the full block where it goes farther: as designed, or as in the row.
+        "post_processed_half_step": _number_or_none(rows[1].distance),
+        # Over the solid reference design where it goes farther: as designed, or as in the row.
         "gain": {
             row.name: _number_or_none(
                 threshold.beyond_rounding(
                     problem.scene, row.distance - np.fmax(row.reference, block)
                 )
             )
-            for row in audits
+            for row in rows
         },
-        "gain_kept": {row.name: _number_or_none(row.kept) for row in others},
+        "retained_gain": {row.name: _number_or_none(row.retained) for row in others},
         "non_discreteness": best.non_discreteness,
         "a": numbers(actuation.a),
         "theta": numbers(actuation.theta),

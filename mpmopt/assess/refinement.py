@@ -16,11 +16,11 @@ from mpmopt.scene import Grid, Scene
 from mpmopt.scene.particles import discretise, nearest_designed
 from mpmopt.validation import instance
 
-VARIANTS = 4  # discretisations that `audit` tries
+VARIANTS = 4  # discretisations that `study` tries
 
 
 @dataclass(frozen=True)
-class Audited:
+class Variant:
     """One simulation of a post-processed design.
 
     Attributes
@@ -30,10 +30,10 @@ class Audited:
     cells : tuple of int
     time_step : float
     reference : float
-        Objective L of the full block with the same actuation, or not a number.
+        Objective L of the solid reference design with the same actuation, or not a number.
     distance : float
         Objective L of the design, or not a number.
-    kept : float
+    retained : float
         Share of the gain over the reference that the design has where it was designed.
     failure : str
         Why there is no number, or empty.
@@ -44,14 +44,14 @@ class Audited:
     time_step: float
     reference: float = np.nan
     distance: float = np.nan
-    kept: float = np.nan
+    retained: float = np.nan
     failure: str = ""
 
 
-def refined(scene: Scene) -> Scene:
+def finer(scene: Scene) -> Scene:
     """The scene with cells half as wide, at the same Courant number, for bodies without grey.
 
-    It has no design filter, which nothing needs that is laid out by `audit`.
+    It has no design filter, which nothing needs that is laid out by `study`.
     """
     nx, ny = scene.grid.cells
     return replace(
@@ -74,7 +74,7 @@ def least(problem: Problem, x: NDArray[np.float64]) -> float:
     scene = problem.scene
     return min(
         distance(there, mapped(there, problem, x), problem.split(x), problem.objective)
-        for there in (scene.vary(time_step=scene.time_step / 2.0), refined(scene))
+        for there in (scene.vary(time_step=scene.time_step / 2.0), finer(scene))
     )
 
 
@@ -89,11 +89,11 @@ def mapped(scene: Scene, problem: Problem, x: NDArray[np.float64]) -> NDArray[np
     return threshold.kept(problem, x)[nearest_designed(discretise(scene), problem.particles)]
 
 
-def audit(
+def study(
     problem: Problem,
     x: NDArray[np.float64],
-    progress: Callable[[Audited], None] | None = None,
-) -> list[Audited]:
+    progress: Callable[[Variant], None] | None = None,
+) -> list[Variant]:
     """Simulate a design without its void again with other steps and cells.
 
     A robot is the same at every discretisation: particles that gamma >= 0.3 makes solid stay, those
@@ -110,7 +110,7 @@ def audit(
 
     Returns
     -------
-    list of Audited
+    list of Variant
         First as it was designed, then with half the step, twice the step, and cells half as wide.
         What cannot be simulated says why.
 
@@ -119,30 +119,30 @@ def audit(
     DesignError
         If x does not fit, or the problem is none.
     """
-    instance("audit", "problem", problem, Problem)
+    instance("study", "problem", problem, Problem)
     variables = problem.split(x)
     scene = problem.scene
     variants: dict[str, Callable[[], Scene]] = {
         "as designed": lambda: scene,
         "half the step": lambda: scene.vary(time_step=scene.time_step / 2.0),
         "twice the step": lambda: scene.vary(time_step=scene.time_step * 2.0),
-        "cells half as wide": lambda: refined(scene),
+        "cells half as wide": lambda: finer(scene),
     }
-    rows: list[Audited] = []
+    rows: list[Variant] = []
     for name, make in variants.items():
         there = scene
         try:
             there = make()
             keep = mapped(there, problem, x)
             reference = distance(there, np.ones_like(keep), variables, problem.objective)
-            row = Audited(name, there.grid.cells, there.time_step, reference)
+            row = Variant(name, there.grid.cells, there.time_step, reference)
             design = distance(there, keep, variables, problem.objective)
             row = replace(row, distance=design)
             gain = rows[0].distance - rows[0].reference if rows else row.distance - reference
-            kept = threshold.share_kept(scene, design - reference, gain)
-            rows.append(replace(row, kept=kept))
+            retained = threshold.retained_share(scene, design - reference, gain)
+            rows.append(replace(row, retained=retained))
         except (SceneError, SimulationError) as error:
-            rows.append(Audited(name, there.grid.cells, there.time_step, failure=str(error)))
+            rows.append(Variant(name, there.grid.cells, there.time_step, failure=str(error)))
         if progress is not None:
             progress(rows[-1])
     return rows

@@ -66,8 +66,7 @@ def solid_body(
         scene,
         particles,
         density=material.density * ones,
-        lame_lambda=material.lame_lambda * ones,
-        lame_mu=material.lame_mu * ones,
+        stiffness=ones,
         signal=signal(scene, variables.a, variables.theta, variables.b),
     )
     return simulation, Objective.of(scene, particles)
@@ -132,10 +131,10 @@ def post_processed(problem: Problem, x: NDArray, threshold: float = THRESHOLD) -
     return distance(problem.scene, keep, variables, problem.objective)
 
 
-def share_kept(scene: Scene, kept: float, gain: float) -> float:
-    """Share of a gain that is kept; not a number if there was none beyond rounding."""
+def retained_share(scene: Scene, retained: float, gain: float) -> float:
+    """Share of a gain that is retained; not a number if there was none beyond rounding."""
     gain = beyond_rounding(scene, gain)
-    return kept / gain if gain > 0.0 else float("nan")
+    return retained / gain if gain > 0.0 else float("nan")
 
 
 def beyond_rounding(scene: Scene, gain: float) -> float:
@@ -180,22 +179,22 @@ def pieces(scene: Scene, keep: NDArray[np.bool_]) -> NDArray[np.int64]:
 
 
 def solid_reference(positions: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """A drawing in which all design particles are there: the simplest reference design."""
+    """A baseline in which all design particles are there: the simplest reference design."""
     return np.ones(len(positions), dtype=bool)
 
 
-def farthest(
+def best_actuated(
     scene: Scene,
-    drawing: Baseline,
+    baseline: Baseline,
     *actuations: Variables,
     objective: Callable[[Simulation], Objective] | None = None,
 ) -> float:
-    """Objective L of a drawn design with the best of some actuations, of those that run.
+    """Objective L of the baseline design with the best of some actuations, of those that run.
 
     Parameters
     ----------
     scene : Scene
-    drawing : callable
+    baseline : callable
         From the design particles' reference positions (D, 2) to which of them are there (D,).
     actuations : Variables
     objective : callable, optional
@@ -207,7 +206,7 @@ def farthest(
         If none runs.
     """
     particles = discretise(scene)
-    keep = drawing(particles.position[particles.designed])
+    keep = baseline(particles.position[particles.designed])
     values, failure = [], None
     for actuation in actuations:
         try:

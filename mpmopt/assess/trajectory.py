@@ -72,9 +72,9 @@ def post_processed(problem: Problem, x: NDArray[np.float64]) -> Body:
 
 
 def reference(problem: Problem, x: NDArray[np.float64]) -> Body:
-    """The reference design, a full block, with the actuation of a design."""
+    """The solid reference design with the actuation of a design."""
     keep = solid_reference(problem.particles.position[problem.particles.designed])
-    return solid("full block, same actuation", problem, x, keep)
+    return solid("solid reference design, same actuation", problem, x, keep)
 
 
 def solid(name: str, problem: Problem, x: NDArray[np.float64], keep: NDArray[np.bool_]) -> Body:

@@ -111,7 +111,7 @@ def kernel_mismatches(scene: Scene, seed: int = 0) -> dict[str, float]:
         "stress": (
             bench.stress,
             bench.stress_adjoint,
-            "affine_velocity deformation mass la mu signal",
+            "affine_velocity deformation mass stiffness signal",
         ),
         "p2g": (bench.p2g, bench.p2g_adjoint, "position velocity affine mass"),
         "grid_update": (bench.grid_update, bench.grid_update_adjoint, "grid"),
@@ -134,7 +134,7 @@ def kernel_mismatches(scene: Scene, seed: int = 0) -> dict[str, float]:
         result["mirror"] = dot_product_mismatch(
             bench.mirror, lambda v, w: {"grid": bench.mirror(w)["grid"]}, grid, rng
         )
-    material = "density", "lame_lambda", "lame_mu"
+    material = "density", "stiffness"
     chain, objective = DesignChain(scene, bench.particles, 2.0), bench.objective
     if bench.particles.designed.any():
         result["design"] = dot_product_mismatch(
@@ -165,8 +165,8 @@ def kernel_mismatches(scene: Scene, seed: int = 0) -> dict[str, float]:
     return result
 
 
-# Names of what the stress depends on, and of the fields of `kernels.ParticleData`.
-CONSTANTS = {"mass": "mass", "la": "lame_lambda", "mu": "lame_mu"}
+# Fields of `kernels.ParticleData` on which the stress depends and that a design changes.
+DESIGNED = ("mass", "stiffness")
 
 
 class _Bench:
@@ -191,8 +191,7 @@ class _Bench:
             scene,
             self.particles,
             scene.material.density * vary,
-            scene.material.lame_lambda * vary,
-            scene.material.lame_mu * vary[::-1],
+            vary[::-1],
             np.full((scene.steps, len(scene.actuators)), 0.7),
             self.state,
         )
@@ -209,10 +208,7 @@ class _Bench:
         affine = rng.standard_normal((4, count)) * np.mean(sample.data.mass) * speed
         self.inputs: Arrays = {
             **own._asdict(),
-            **{
-                short: kernels.ungrouped(getattr(self.data, name), 1, count)
-                for short, name in CONSTANTS.items()
-            },
+            **{name: kernels.ungrouped(getattr(self.data, name), 1, count) for name in DESIGNED},
             "signal": np.full(len(scene.actuators), 0.7),
             "affine": affine,
             "node_velocity": speed * rng.standard_normal((self.fields, self.nodes, 2)),
@@ -262,13 +258,9 @@ class _Bench:
 
     def _data(self, v: Arrays, dtype: type) -> kernels.ParticleData:
         data = self.data._replace(
-            **{
-                name: kernels.grouped(v[short], repeat=False)
-                for short, name in CONSTANTS.items()
-                if short in v
-            }
+            **{name: kernels.grouped(v[name], repeat=False) for name in DESIGNED if name in v}
         )
-        floats = ("volume", *CONSTANTS.values())
+        floats = ("volume", *DESIGNED)
         return data._replace(**{name: getattr(data, name).astype(dtype) for name in floats})
 
     def deform(self, v: Arrays) -> Arrays:
@@ -314,7 +306,7 @@ class _Bench:
         return {
             "affine_velocity": found.affine_velocity,
             "deformation": found.deformation,
-            **{short: self._particles(getattr(data_bar, n), 1) for short, n in CONSTANTS.items()},
+            **{name: self._particles(getattr(data_bar, name), 1) for name in DESIGNED},
             "signal": signal_bar,
         }
 

@@ -113,7 +113,7 @@ def non_discreteness(gamma: NDArray) -> float:
 
 
 class DesignChain:
-    """Design variables phi (D,) in [-1, 1] to mass density and Lame constants of all N particles.
+    """Design variables phi (D,) in [-1, 1] to mass density and stiffness of all N particles.
 
     Parameters
     ----------
@@ -166,8 +166,8 @@ class Field:
         Filtered phi.
     gamma : (D,) array
         Material density of the design particles, within [0, 1].
-    density, lame_lambda, lame_mu : (N,) arrays
-        Of all particles.
+    density, stiffness : (N,) arrays
+        Of all particles; stiffness as a share of the solid's.
     """
 
     chain: DesignChain
@@ -175,32 +175,30 @@ class Field:
     filtered: NDArray
     gamma: NDArray
     density: NDArray
-    lame_lambda: NDArray
-    lame_mu: NDArray
+    stiffness: NDArray
 
     def __post_init__(self) -> None:
-        own(self, "phi", "filtered", "gamma", "density", "lame_lambda", "lame_mu")
+        own(self, "phi", "filtered", "gamma", "density", "stiffness")
 
-    def pullback(self, density_bar: NDArray, lambda_bar: NDArray, mu_bar: NDArray) -> NDArray:
-        """phi_bar (D,) from the adjoints of rho, lambda and mu, (N,) each."""
+    def pullback(self, density_bar: NDArray, stiffness_bar: NDArray) -> NDArray:
+        """phi_bar (D,) from the adjoints of density and stiffness, (N,) each."""
         chain = self.chain
-        gamma_bar = interpolate_adjoint(chain.material, density_bar, lambda_bar, mu_bar)
+        gamma_bar = interpolate_adjoint(chain.material, density_bar, stiffness_bar)
         phi_bar = project_adjoint(self.filtered, chain.beta, gamma_bar[chain.designed])
         return chain.filter.T @ phi_bar
 
 
-def interpolate(material: Material, gamma: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    """rho, lambda and mu, linear in gamma between the floors and the solid (paper, sec. 2.2)."""
+def interpolate(material: Material, gamma: NDArray) -> tuple[NDArray, NDArray]:
+    """Density and stiffness, linear in gamma between floors and solid (paper, sec. 2.2)."""
     mass = (1.0 - material.void_density) * gamma + material.void_density
     stiffness = (1.0 - material.void_stiffness) * gamma + material.void_stiffness
-    return material.density * mass, material.lame_lambda * stiffness, material.lame_mu * stiffness
+    return material.density * mass, stiffness
 
 
 def interpolate_adjoint(
-    material: Material, density_bar: NDArray, lambda_bar: NDArray, mu_bar: NDArray
+    material: Material, density_bar: NDArray, stiffness_bar: NDArray
 ) -> NDArray:
-    """gamma_bar from the adjoints of rho, lambda and mu."""
-    stiffness_bar = material.lame_lambda * lambda_bar + material.lame_mu * mu_bar
+    """gamma_bar from the adjoints of density and stiffness."""
     return (1.0 - material.void_density) * material.density * density_bar + (
         1.0 - material.void_stiffness
     ) * stiffness_bar

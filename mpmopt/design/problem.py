@@ -24,7 +24,7 @@ from mpmopt.simulation.indicators import Indicators
 from mpmopt.simulation.simulation import Precision, Simulation, check_precision
 from mpmopt.validation import count, instance, share
 
-PICTURE = (
+ORDER_HINT = (
     ": its entries are values at problem.particles.position[problem.particles.designed], column by "
     "column from below; look a picture up there (see Problem.join), do not ravel it"
 )
@@ -175,7 +175,7 @@ class Problem:
         for name, value, size in zip(Variables._fields, (phi, a, theta, b), sizes):
             array = _real(name, value)
             if array.size not in (1, size) or array.ndim > 1:
-                hint = PICTURE if name == "phi" else ""
+                hint = ORDER_HINT if name == "phi" else ""
                 raise DesignError(
                     f"{name} has shape {array.shape}, must have {(size,)} or (){hint}"
                 )
@@ -233,8 +233,7 @@ class Problem:
             self.scene,
             self.particles.subset(present),
             field.density[present],
-            field.lame_lambda[present],
-            field.lame_mu[present],
+            field.stiffness[present],
             signal(self.scene, a, theta, b),
             precision=self.precision,
         )
@@ -242,7 +241,8 @@ class Problem:
     def objective(self, simulation: Simulation) -> Objective:
         """How far the body of a simulation goes: of this problem's, or of a solid one of its scene.
 
-        What pictures, post-processing and audits measure too, should a subclass have another.
+        What pictures, post-processing and refinement studies measure too, should a subclass have
+        another.
         """
         return Objective.of(simulation.scene, simulation.particles)
 
@@ -327,8 +327,8 @@ class Problem:
             self._check(forward.indicators, simulation)
             value = float(_finite(objective.value(forward.states), simulation))
             gradient = forward.reverse(objective.terminal_adjoints(forward.states))
-        bars = np.zeros((3, len(self.particles.position)))
-        bars[:, self.present(phi)] = gradient.density, gradient.lame_lambda, gradient.lame_mu
+        bars = np.zeros((2, len(self.particles.position)))
+        bars[:, self.present(phi)] = gradient.density, gradient.stiffness
         phi_bar = self.chain.field(phi).pullback(*bars)
         parts = phi_bar, *signal_adjoint(self.scene, a, theta, gradient.signal)
         whole = _finite(np.concatenate(parts), simulation)

@@ -62,8 +62,8 @@ def check_indicators(indicators: Indicators, simulation: Simulation, limits: Ind
     Raises
     ------
     SimulationError
-        If the step is too long; a `FractureError` if solid is torn and an `OverlapError` if parts
-        of it lie in each other, which no step mends.
+        If the step is too long; a `FractureError` if solid is fractured and an `OverlapError` if
+        parts of it lie in each other, which no step mends.
     """
     flattest = 1.0 / limits.jacobian if limits.jacobian > 0.0 else math.inf
     for what, value, limit in (

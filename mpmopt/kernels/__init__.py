@@ -54,11 +54,13 @@ from mpmopt.kernels.arrays import (
     ungrouped,
 )
 from mpmopt.kernels.barrier import meet
+from mpmopt.kernels.compiler import plain
 from mpmopt.kernels.contact import wall, wall_adjoint
 from mpmopt.kernels.deformation import deform, deform_adjoint
 from mpmopt.kernels.energy import energy, grips
 from mpmopt.kernels.grid import free_velocity, grid_update, grid_update_adjoint, mirror
 from mpmopt.kernels.indicators import indicators
+from mpmopt.kernels.material import PARAMETERS, kirchhoff, wave_modulus
 from mpmopt.kernels.overlap import closest
 from mpmopt.kernels.spline import (
     expand,
@@ -91,6 +93,7 @@ __all__ = [
     "ESCAPED",
     "INVERTED",
     "NODE_SIZE",
+    "PARAMETERS",
     "PART_TOO_SMALL",
     "STATE_SIZE",
     "WINDOW_TOO_SMALL",
@@ -123,6 +126,7 @@ __all__ = [
     "inertia",
     "inertia_adjoint",
     "interpolation",
+    "kirchhoff",
     "locate",
     "make_tile",
     "meet",
@@ -130,6 +134,7 @@ __all__ = [
     "p2g",
     "p2g_adjoint",
     "parts",
+    "plain",
     "stress",
     "stress_adjoint",
     "taylor",
@@ -137,6 +142,7 @@ __all__ = [
     "ungrouped",
     "wall",
     "wall_adjoint",
+    "wave_modulus",
     "weights",
     "whole_window",
 ]

@@ -48,6 +48,7 @@ class Parameters(NamedTuple):
     walls: NDArray[np.float64]  # (W, columns) as `contact` names them
     mirror_axis: int  # of the mirror plane's normal: 0 or 1; -1: no mirror
     mirror_node: int  # line of nodes that is the plane
+    viscous: bool  # whether a material has a viscosity
     keep: float  # share of what the grid smoothed away that particles keep; 0: no blend
     mass_tolerance: float  # mass of a node that is rounding of larger ones: the node is empty
 
@@ -57,8 +58,8 @@ class ParticleData(NamedTuple):
 
     volume: NDArray  # (G, 4) reference volume
     mass: NDArray  # (G, 4)
-    lame_lambda: NDArray  # (G, 4)
-    lame_mu: NDArray  # (G, 4)
+    stiffness: NDArray  # (G, 4) share of the solid's stiffness
+    constants: NDArray  # (P, G, 4) of the solid, in the order of `material.PARAMETERS`
     active: NDArray[np.bool_]  # (G,) whether a group has actuated particles
     actuated: NDArray[np.float64]  # (K, G, 4) 1 for the particles of actuator k, else 0
     actuation_stress: NDArray[np.float64]  # (K, 3) second Piola-Kirchhoff S: xx, xy, yy
@@ -69,8 +70,7 @@ class ParticleDataBar(NamedTuple):
     """Adjoints of `ParticleData`, accumulated over the steps."""
 
     mass: NDArray  # (G, 4)
-    lame_lambda: NDArray  # (G, 4)
-    lame_mu: NDArray  # (G, 4)
+    stiffness: NDArray  # (G, 4)
 
     @classmethod
     def zeros(cls, groups: int, dtype: DTypeLike = float) -> "ParticleDataBar":

@@ -59,6 +59,11 @@ def jit(function: Callable[..., Any]) -> Any:
     return _stamped(njit(**OPTIONS, forceinline=True)(function))
 
 
+def plain(kernel: Any) -> Any:
+    """A kernel as it is written, for numbers and arrays in Python."""
+    return getattr(kernel, "py_func", kernel)
+
+
 def _stamped(kernel: Any) -> Any:
     file = getattr(getattr(kernel, "_cache", None), "_cache_file", None)
     if file is not None:  # the compiler and its cache are on

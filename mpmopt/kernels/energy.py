@@ -9,7 +9,7 @@ from mpmopt.kernels.actuation import squeezed
 from mpmopt.kernels.arrays import AFFINE, POSITION, VELOCITY, at, components
 from mpmopt.kernels.compiler import loop_jit
 from mpmopt.kernels.deformation import midway
-from mpmopt.kernels.material import energy_density
+from mpmopt.kernels.material import constants_of_one, energy_density
 
 
 @loop_jit
@@ -26,7 +26,6 @@ def energy(state: NDArray, data: Any, parameters: Any) -> tuple[float, float]:
             mass, volume = float(data.mass[g, k].real), float(data.volume[g, k].real)
             if mass == 0.0:  # only fills its group
                 continue
-            mu, lam = float(data.lame_mu[g, k].real), float(data.lame_lambda[g, k].real)
             x, y = float(state[at(g, POSITION), k].real), float(state[at(g, POSITION + 1), k].real)
             u, v = float(state[at(g, VELOCITY), k].real), float(state[at(g, VELOCITY + 1), k].real)
             c00, c01, c10, c11 = components(state, g, AFFINE, k)
@@ -36,7 +35,7 @@ def energy(state: NDArray, data: Any, parameters: Any) -> tuple[float, float]:
                 return math.inf, math.inf
             turning = c00 * c00 + c01 * c01 + c10 * c10 + c11 * c11
             kinetic += 0.5 * mass * (u * u + v * v + inertia * turning)
-            potential += volume * energy_density(F, math.log(J), lam, mu)
+            potential += volume * energy_density(F, math.log(J), constants_of_one(data, g, k))
             potential -= mass * parameters.gravity_x * (x - half * u)
             potential -= mass * parameters.gravity_y * (y - half * v)
     return kinetic, potential

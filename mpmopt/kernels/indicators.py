@@ -5,33 +5,40 @@ import math
 from mpmopt.kernels.arrays import AFFINE, DEFORMATION, components
 from mpmopt.kernels.compiler import jit
 from mpmopt.kernels.deformation import stretches
-from mpmopt.kernels.material import wave_modulus
+from mpmopt.kernels.material import constants_of_one, wave_modulus
+from mpmopt.kernels.viscosity import viscous_modulus
+
+SOLID = 0.5
 
 
 @jit
-def indicators(state, data, parameters, solid, first, last):
+def indicators(state, data, parameters, first, last):
     """How close groups of particles come to where a step is too long, as in `Indicators`.
 
-    The largest (dt / dx) sqrt(M / rho) and dt |C|, the smallest J, and the largest stretch of
-    particles whose mu is at least `solid`; M is their `wave_modulus`. Extremes do not depend on the
-    order in which they are taken.
+    The largest Courant number and dt |C|, the smallest J, and the largest stretch of
+    particles with `SOLID` of the solid's stiffness or more; with its
+    `wave_modulus` M and `viscous_modulus` N, an isolated particle is unstable where the Courant
+    number k_v + sqrt(k_v^2 + k_e^2) is above 1, k_e^2 = (dt/dx)^2 M/rho and k_v = dt/dx^2 N/rho.
+    Extremes do not depend on the order in which they are taken.
     """
-    stiffest = fastest = longest = 0.0
+    courant = fastest = longest = 0.0
+    per_cell = parameters.dt / parameters.dx
     smallest = math.inf
     for g in range(first, last):
         for k in range(4):
             mass, volume = data.mass[g, k].real, data.volume[g, k].real
             if mass > 0.0:  # else it only fills its group
-                mu, lam = data.lame_mu[g, k].real, data.lame_lambda[g, k].real
                 c00, c01, c10, c11 = components(state, g, AFFINE, k)
                 F = components(state, g, DEFORMATION, k)
                 trace, apart = stretches(F)
-                stiffness = wave_modulus(trace, apart, lam, mu)
-                if mu >= solid:
+                constants, specific = constants_of_one(data, g, k), volume / mass
+                elastic = per_cell * per_cell * wave_modulus(trace, apart, constants) * specific
+                viscous = viscous_modulus(trace, apart, constants) * specific
+                viscous *= per_cell / parameters.dx
+                if data.stiffness[g, k].real >= SOLID:
                     longest = max(longest, 0.5 * (trace + math.sqrt(apart)))
-                stiffest = max(stiffest, stiffness * volume / mass)
+                courant = max(courant, viscous + math.sqrt(viscous * viscous + elastic))
                 fastest = max(fastest, c00 * c00 + c01 * c01 + c10 * c10 + c11 * c11)
                 smallest = min(smallest, F[0] * F[3] - F[1] * F[2])
-    courant = parameters.dt / parameters.dx * math.sqrt(stiffest)
     velocity_increment = parameters.dt * math.sqrt(fastest)
     return courant, velocity_increment, smallest, math.sqrt(longest)

@@ -99,6 +99,11 @@ def fused(a, b, c):
     return a * b + c
 
 
+def product(x, y):
+    """x y of records, rounded by itself: no compiler may take it apart or contract it."""
+    return x * y
+
+
 def real(x):
     """The real parts of a record."""
     return np.real(x)
@@ -454,6 +459,14 @@ def _overload_divide(x, y):
 
 
 @intrinsic
+def _product(typingctx, x, y):
+    def generate(context, builder, signature, arguments):
+        return builder.fmul(*arguments, flags=("nsz",))
+
+    return x(x, y), generate
+
+
+@intrinsic
 def _lane(typingctx, record, k):
     def generate(context, builder, signature, arguments):
         lane = builder.trunc(arguments[1], INT32)
@@ -622,6 +635,13 @@ def _overload_fused(a, b, c):
     if types.complex128 in (a, b, c):
         return lambda a, b, c: complex(_fused(a.real, b.real, c.real), (a * b + c).imag)
     return lambda a, b, c: _fused(a, b, c)
+
+
+@overload(product)
+def _overload_product(x, y):
+    if types.complex128 in (x.dtype, y.dtype):
+        return lambda x, y: x * y
+    return lambda x, y: _product(x, y)
 
 
 @overload(within)

@@ -24,8 +24,6 @@ class Iteration:
 
     Attributes
     ----------
-    start : int
-        Index of the start that it goes back to.
     stage : int
         Index of the stage.
     beta, move_limit : float
@@ -44,7 +42,7 @@ class Iteration:
         Since the optimisation began, without the time between a stop and going on.
     post_processed : float
         L without void, or not a number if the stage does not ask for it or it failed.
-    audited : float
+    refined : float
         L without void with half the step or cells half as wide, whichever is less; not a number if
         the stage does not ask for it or the design could not be its best anyway, minus infinity if
         it failed.
@@ -56,7 +54,6 @@ class Iteration:
         Why the evaluation failed, or empty.
     """
 
-    start: int
     stage: int
     beta: float
     time_step: float
@@ -67,7 +64,7 @@ class Iteration:
     step: float
     seconds: float
     post_processed: float = np.nan
-    audited: float = np.nan
+    refined: float = np.nan
     halved: int = 0
     courant: float = np.nan
     velocity_increment: float = np.nan
@@ -80,7 +77,7 @@ class Iteration:
     @property
     def counted(self) -> float:
         """L without void, the least that was found; minus infinity if there is none."""
-        least = float(np.fmin(self.post_processed, self.audited))
+        least = float(np.fmin(self.post_processed, self.refined))
         return -np.inf if np.isnan(least) else least
 
     def numbers(self) -> dict[str, Any]:
@@ -107,33 +104,6 @@ class Candidate(Iteration):
         own(self, "x", "gamma")
 
 
-@dataclass
-class Leg:
-    """How far one start has come.
-
-    Attributes
-    ----------
-    start : int
-        Its index.
-    x : (n,) array
-        The design that its stage began with.
-    stage : int
-        The stage that it is in, or after the last.
-    reason : str
-        Why its last stage ended; empty before.
-    gave_up : bool
-    best : dict of int to Candidate
-        The best evaluation of each stage that had one.
-    """
-
-    start: int
-    x: NDArray[np.float64]
-    stage: int = 0
-    reason: str = ""
-    gave_up: bool = False
-    best: dict[int, Candidate] = field(default_factory=dict)
-
-
 @dataclass(frozen=True)
 class StageState:
     """A stage just after an evaluation: all that its next step depends on.
@@ -147,9 +117,9 @@ class StageState:
         Objectives of those that succeeded.
     gradient : (n,) array
         Of the last evaluation, empty if it failed.
-    farthest : Candidate or None
+    incumbent : Candidate or None
         The one with the largest objective.
-    farthest_gradient : (n,) array
+    incumbent_gradient : (n,) array
         Its gradient, empty if there is none.
     mma : mapping of str to array or number
         `MovingAsymptotes.state` before the step.
@@ -159,12 +129,12 @@ class StageState:
     failures: int
     values: NDArray[np.float64]
     gradient: NDArray[np.float64]
-    farthest: Candidate | None
-    farthest_gradient: NDArray[np.float64]
+    incumbent: Candidate | None
+    incumbent_gradient: NDArray[np.float64]
     mma: Mapping[str, Any]
 
     def __post_init__(self) -> None:
-        own(self, "values", "gradient", "farthest_gradient")
+        own(self, "values", "gradient", "incumbent_gradient")
 
 
 @dataclass(repr=False)
@@ -175,10 +145,16 @@ class Optimisation:
     ----------
     scene : Scene
     settings : Settings
-    legs : list of Leg
-        One for each start.
-    leg : int
-        Index of the one that goes on.
+    x : (n,) array
+        The design that its stage began with.
+    stage : int
+        The stage that it is in, or after the last.
+    reason : str
+        Why its last stage ended; empty before.
+    gave_up : bool
+        Whether that stage failed.
+    best : dict of int to Candidate
+        The best evaluation of each stage that had one.
     history : list of Iteration
         All evaluations.
     first, last : Candidate or None
@@ -191,8 +167,11 @@ class Optimisation:
 
     scene: Scene
     settings: Settings
-    legs: list[Leg]
-    leg: int = 0
+    x: NDArray[np.float64]
+    stage: int = 0
+    reason: str = ""
+    gave_up: bool = False
+    best: dict[int, Candidate] = field(default_factory=dict)
     history: list[Iteration] = field(default_factory=list)
     first: Candidate | None = None
     last: Candidate | None = None
@@ -200,16 +179,11 @@ class Optimisation:
     stop_reason: str = ""
 
     @property
-    def best(self) -> dict[int, Candidate]:
-        """The best evaluation of each stage that had one, of the start that goes on."""
-        return self.legs[self.leg].best
-
-    @property
     def result(self) -> Candidate:
         """The best evaluation on the last stage's grid.
 
         That is the one that counts most (`Candidate.counted`), where stages ask for bodies without
-        void, and of audited stages where there are some; else the best of the last stage that had
+        void, and of refined stages where there are some; else the best of the last stage that had
         one, whose projection is the sharpest.
 
         Raises
@@ -224,8 +198,8 @@ class Optimisation:
         grid = stages[max(self.best)].coarsening
 
         def merit(item: Candidate) -> tuple[bool, float, int]:
-            audited = stages[item.stage].audited and np.isfinite(item.counted)
-            return bool(audited), item.counted, item.stage
+            refined = stages[item.stage].refined and np.isfinite(item.counted)
+            return bool(refined), item.counted, item.stage
 
         on_grid = (item for stage, item in self.best.items() if stages[stage].coarsening == grid)
         return max(on_grid, key=merit)
@@ -263,5 +237,5 @@ class Optimisation:
 
     @property
     def halved_evaluations(self) -> int:
-        """Number of evaluations that were halved with a shorter time step."""
+        """Number of evaluations that were repeated with a shorter time step."""
         return sum(iteration.halved > 0 for iteration in self.history)

@@ -15,7 +15,7 @@ from mpmopt.assess.threshold import post_processed
 from mpmopt.design.chain import non_discreteness
 from mpmopt.design.problem import Problem
 from mpmopt.errors import DesignError, SceneError, SimulationError
-from mpmopt.optimisation.history import Candidate, Iteration, Leg, Optimisation, StageState
+from mpmopt.optimisation.history import Candidate, Iteration, Optimisation, StageState
 from mpmopt.optimisation.mma import MovingAsymptotes
 from mpmopt.optimisation.settings import Settings
 from mpmopt.scene import Scene
@@ -38,23 +38,22 @@ HOW = "write Settings(stages), or call what makes them, such as continuation(tim
 def optimise(
     scene: Scene,
     settings: Settings,
-    start: NDArray[np.float64] | Sequence[float] | Sequence[NDArray[np.float64]],
+    start: NDArray[np.float64] | Sequence[float],
     callbacks: Iterable[Callback] | Callback = (),
     checkpointing: Checkpointing | None = None,
 ) -> Optimisation:
     """Maximise the distance travelled, stage by stage.
 
-    An evaluation that fails steps back to the stage's farthest design and halves the move limit,
-    which then recovers slowly. A stage of which no design ran yet takes the best of the one before,
-    and if that fails too, halves its time step.
+    An evaluation that fails steps back to the stage's incumbent and halves the move limit, which
+    then recovers slowly. A stage of which no design ran yet takes the best of the one before, and
+    if that fails too, halves its time step.
 
     Parameters
     ----------
     scene : Scene
     settings : Settings
-    start : (n,) array, or several
-        First design, within [-1, 1], of the first stage's scene (`Problem.join` makes it). Of
-        several the best after `Settings.scouting` stages goes on.
+    start : (n,) array
+        First design, within [-1, 1], of the first stage's scene (`Problem.join` makes it).
     callbacks : iterable of callable, or one
         Called after each evaluation and once at the end.
     checkpointing : Checkpointing, optional
@@ -73,11 +72,7 @@ def optimise(
     return go_on(begin(scene, settings, start), callbacks, checkpointing)
 
 
-def begin(
-    scene: Scene,
-    settings: Settings,
-    start: NDArray[np.float64] | Sequence[float] | Sequence[NDArray[np.float64]],
-) -> Optimisation:
+def begin(scene: Scene, settings: Settings, start: Any) -> Optimisation:
     """An optimisation before its first evaluation, for `go_on`; see `optimise`.
 
     Raises
@@ -87,18 +82,12 @@ def begin(
     """
     instance("optimise", "scene", scene, Scene)
     instance("optimise", "settings", settings, Settings, HOW)
-    several = isinstance(start, Iterable) and not isinstance(start, np.ndarray)
-    starts: list[Any] = list(start) if several else [start]
-    if starts and all(isinstance(value, (int, float, np.number)) for value in starts):
-        starts = [starts]
     scenes = [stage.scene(scene) for stage in settings.stages]
     first = Problem(scenes[0])
-    designs = [first.join(*first.split(x)) for x in starts]
-    if not designs or first.size == 0:
-        raise DesignError("there is nothing to design: give a Design or an Actuator, and a start")
-    if len(designs) > 1 and settings.scouting == 0:
-        raise DesignError(f"{len(designs)} starts need Settings.scouting >= 1, the stages of each")
-    return Optimisation(scene, settings, [Leg(k, x) for k, x in enumerate(designs)])
+    if first.size == 0:
+        raise DesignError("there is nothing to design: give a Design or an Actuator")
+    check_body_fits(scene)
+    return Optimisation(scene, settings, first.join(*first.split(start)))
 
 
 def check_body_fits(scene: Scene) -> None:
@@ -150,7 +139,7 @@ def go_on(
     SceneError, StorageError
         As `optimise`.
     DesignError
-        If its legs do not fit its settings, or a callback is none.
+        If its stage does not fit its settings, or a callback is none.
     """
     instance("go_on", "run", run, Optimisation)
     several = isinstance(callbacks, Iterable) and not callable(callbacks)
@@ -161,70 +150,33 @@ def go_on(
                 f"callback {shown(callback)} must be a function of the run, or an object that is "
                 "called like one, such as ProgressBar()"
             )
-    stages = len(run.settings.stages)
-    for index, leg in enumerate(run.legs):
-        if leg.start != index or not 0 <= leg.stage <= stages:
-            raise DesignError(
-                f"leg {index} is of start {leg.start}, at stage {leg.stage} of {stages}: the run "
-                "was changed, take a copy of it"
-            )
-    if not run.history:
-        check_body_fits(run.scene)
-    climb = _Climb(run, tuple(all_callbacks), checkpointing)
+    stages = run.settings.stages
+    if not 0 <= run.stage <= len(stages):
+        raise DesignError(
+            f"the run is at stage {run.stage} of {len(stages)}: it was changed, take a copy of it"
+        )
     if run.stop_reason:
         return run
-    scouting = run.settings.scouting if len(run.legs) > 1 else 0
-    for leg in run.legs:
-        if leg.stage < scouting and not leg.gave_up:
-            run.leg = leg.start
-            climb.stages(leg, scouting)
-    run.leg = max(run.legs, key=lambda leg: _merit(run, leg)).start
-    leg = run.legs[run.leg]
-    climb.stages(leg, stages)
-    reached = leg.stage + leg.gave_up
-    run.stop_reason = f"Stage {reached} of {stages} was the last: {leg.reason}"
-    climb.report()
+    began = time.monotonic() - (run.history[-1].seconds if run.history else 0.0)
+
+    def report() -> None:
+        for callback in all_callbacks:
+            callback(run)
+
+    while run.stage < len(stages) and not run.gave_up:
+        ascent = _Ascent(run, report, checkpointing, began)
+        if run.stage_state is None and run.stage:
+            before = stages[run.stage - 1]
+            if ascent.stage.coarsening != before.coarsening:
+                run.x = ascent.problem.transfer(Problem(before.scene(run.scene)), run.x)
+        run.x, run.reason, run.gave_up = ascent.to_end()
+        run.stage_state = None
+        logger.info("stage %d: %s", run.stage, run.reason)
+        run.stage += not run.gave_up
+    reached = run.stage + run.gave_up
+    run.stop_reason = f"Stage {reached} of {len(stages)} was the last: {run.reason}"
+    report()
     return run
-
-
-def _merit(run: Optimisation, leg: Leg) -> tuple[int, float]:
-    """What starts are compared by: the last stage that had a design, and its best."""
-    if not leg.best:
-        return -1, -np.inf
-    item = leg.best[max(leg.best)]
-    return item.stage, item.counted if run.settings.stages[item.stage].solid else item.objective
-
-
-class _Climb:
-    """An optimisation on its way through the stages."""
-
-    def __init__(
-        self,
-        run: Optimisation,
-        callbacks: tuple[Callback, ...],
-        checkpointing: Checkpointing | None,
-    ) -> None:
-        self.run, self.callbacks, self.checkpointing = run, callbacks, checkpointing
-        self.scenes = [stage.scene(run.scene) for stage in run.settings.stages]
-        self.began = time.monotonic() - (run.history[-1].seconds if run.history else 0.0)
-
-    def report(self) -> None:
-        for callback in self.callbacks:
-            callback(self.run)
-
-    def stages(self, leg: Leg, last: int) -> None:
-        """Climb from where a leg stands through the stages before `last`."""
-        stages = self.run.settings.stages
-        while leg.stage < last and not leg.gave_up:
-            stage = _StageRun(self, leg)
-            before = leg.stage - 1
-            begins = self.run.stage_state is None and before >= 0
-            if begins and stage.stage.coarsening != stages[before].coarsening:
-                leg.x = stage.problem.transfer(Problem(self.scenes[before]), leg.x)
-            leg.x, leg.reason, leg.gave_up = stage.climb()
-            self.run.stage_state = None
-            logger.info("start %d, stage %d: %s", leg.start, leg.stage, leg.reason)
-            leg.stage += not leg.gave_up
 
 
 def _order(item: Iteration) -> tuple[float, float, float]:
@@ -232,13 +184,20 @@ def _order(item: Iteration) -> tuple[float, float, float]:
     return item.counted, float(np.nan_to_num(item.post_processed, nan=-np.inf)), item.objective
 
 
-class _StageRun:
-    """One stage on its way: from its first design, or from its state after an evaluation."""
+class _Ascent:
+    """The ascent of one stage: from its first design, or from its state after an evaluation."""
 
-    def __init__(self, whole: _Climb, leg: Leg) -> None:
-        self.whole, self.run, self.leg = whole, whole.run, leg
-        settings = self.run.settings
-        self.stage = settings.stages[leg.stage]
+    def __init__(
+        self,
+        run: Optimisation,
+        report: Callable[[], None],
+        checkpointing: Checkpointing | None,
+        began: float,
+    ) -> None:
+        self.run, self.report = run, report
+        self.checkpointing, self.began = checkpointing, began
+        settings = run.settings
+        self.stage = settings.stages[run.stage]
         # All lengths are taken in these, so that no unit decides anything.
         self.width = max(self.run.scene.grid.size)
         state = self.run.stage_state
@@ -251,16 +210,16 @@ class _StageRun:
         )
         self.values: list[float] = []
         self.failures = 0
-        self.farthest: Candidate | None = None
-        self.gradient = self.farthest_gradient = np.empty(0)
+        self.incumbent: Candidate | None = None
+        self.gradient = self.incumbent_gradient = np.empty(0)
         if state:
             self.mma.restore(state.mma)
             self.values, self.failures = state.values.tolist(), state.failures
             self.gradient = state.gradient
-            self.farthest, self.farthest_gradient = state.farthest, state.farthest_gradient
+            self.incumbent, self.incumbent_gradient = state.incumbent, state.incumbent_gradient
 
     def _pose(self, time_step: float | None) -> None:
-        self.problem = self.stage.problem(self.run.scene, time_step, self.whole.checkpointing)
+        self.problem = self.stage.problem(self.run.scene, time_step, self.checkpointing)
 
     def state(self) -> StageState:
         """All that the next step depends on."""
@@ -269,18 +228,18 @@ class _StageRun:
             failures=self.failures,
             values=np.array(self.values),
             gradient=self.gradient,
-            farthest=self.farthest,
-            farthest_gradient=self.farthest_gradient,
+            incumbent=self.incumbent,
+            incumbent_gradient=self.incumbent_gradient,
             mma=self.mma.state(),
         )
 
-    def climb(self) -> tuple[NDArray[np.float64], str, bool]:
-        """Climb to where the stop rule ends the stage.
+    def to_end(self) -> tuple[NDArray[np.float64], str, bool]:
+        """Go to where the stop rule ends the stage.
 
         Returns the design that the next stage starts from, why it stopped, and whether to give up.
         """
         if self.run.stage_state is None:
-            self._evaluate(self.leg.x)
+            self._evaluate(self.run.x)
         while True:
             assert self.run.last is not None
             x, reason = self.run.last.x, self._stop_reason()
@@ -288,15 +247,15 @@ class _StageRun:
                 self._evaluate(self._step(x))
             elif self.failures:
                 return x, reason, True
-            elif self.farthest is not None and self.run.settings.best_first:
-                return self.farthest.x, reason, False
+            elif self.incumbent is not None and self.run.settings.best_first:
+                return self.incumbent.x, reason, False
             else:
                 return x, reason, False
 
     def _step(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """The design to evaluate after x."""
         mma = self.mma
-        if self.failures and self.farthest is None:
+        if self.failures and self.incumbent is None:
             spare = self._best_before()
             if spare is not None and not np.array_equal(spare, x):
                 return spare
@@ -304,10 +263,10 @@ class _StageRun:
             logger.warning("no design of this stage ran yet: time step %g halved", scene.time_step)
             self._pose(scene.time_step / 2.0)
             return x
-        if self.failures and self.farthest is not None:
+        if self.failures and self.incumbent is not None:
             mma.reset()
             mma.move_limit /= 2.0
-            return self._move(self.farthest.x, self.farthest.objective, self.farthest_gradient)
+            return self._move(self.incumbent.x, self.incumbent.objective, self.incumbent_gradient)
         went_back = len(self.values) > 1 and self.values[-1] < self.values[-2]
         factor = SHORTEN if went_back and self.run.settings.adapt_move_limit else LENGTHEN
         mma.move_limit = min(self.stage.move_limit, factor * mma.move_limit)
@@ -321,10 +280,12 @@ class _StageRun:
 
     def _best_before(self) -> NDArray[np.float64] | None:
         """The best design of the stage before, on this stage's grid."""
-        before = self.run.best.get(self.leg.stage - 1)
+        before = self.run.best.get(self.run.stage - 1)
         if before is None or before.x.size == self.problem.size:
             return before.x if before else None
-        return self.problem.transfer(Problem(self.whole.scenes[before.stage]), before.x)
+        return self.problem.transfer(
+            Problem(self.run.settings.stages[before.stage].scene(self.run.scene)), before.x
+        )
 
     def _evaluate(self, x: NDArray[np.float64]) -> None:
         """Value and gradient, recorded, even of a simulation that failed."""
@@ -342,22 +303,21 @@ class _StageRun:
         except SimulationError as error:
             failure = str(error)
             logger.warning("evaluation %d failed: %s", len(run.history), error)
-        solid = audited = np.nan
+        solid = refined = np.nan
         if self.stage.solid and not failure:
             solid = self._without_void(post_processed, problem.at(time_step), x)
-            best = run.best.get(self.leg.stage)
+            best = run.best.get(run.stage)
             hopeful = solid > (best.counted if best else -np.inf)
-            if self.stage.audited and hopeful:
-                audited = self._without_void(refinement.least, problem.at(time_step), x)
-                audited = -np.inf if np.isnan(audited) else audited
+            if self.stage.refined and hopeful:
+                refined = self._without_void(refinement.least, problem.at(time_step), x)
+                refined = -np.inf if np.isnan(refined) else refined
         before = run.last.x if run.last else x
         if before.size != x.size:  # another grid
             before = x
         free = np.where(gradient > 0.0, x < 1.0, x > -1.0)
         gamma = self.problem.gamma(x)
         candidate = Candidate(
-            start=self.leg.start,
-            stage=self.leg.stage,
+            stage=run.stage,
             beta=self.stage.beta,
             time_step=time_step,
             move_limit=self.mma.move_limit,
@@ -367,9 +327,9 @@ class _StageRun:
             non_discreteness=non_discreteness(gamma),
             projected_gradient=float(np.abs(gradient * free).max()),
             step=float(np.abs(x - before).max() / 2.0),
-            seconds=time.monotonic() - self.whole.began,
+            seconds=time.monotonic() - self.began,
             post_processed=solid,
-            audited=audited,
+            refined=refined,
             halved=halved,
             courant=indicators.courant,
             velocity_increment=indicators.velocity_increment,
@@ -380,7 +340,7 @@ class _StageRun:
             failure=failure,
         )
         self._record(candidate, gradient)
-        self.whole.report()
+        self.report()
 
     def _record(self, candidate: Candidate, gradient: NDArray[np.float64]) -> None:
         run = self.run
@@ -394,8 +354,8 @@ class _StageRun:
             self.failures = 0
             self.values.append(candidate.objective)
             self.gradient = gradient
-            if self.farthest is None or candidate.objective > self.farthest.objective:
-                self.farthest, self.farthest_gradient = candidate, gradient
+            if self.incumbent is None or candidate.objective > self.incumbent.objective:
+                self.incumbent, self.incumbent_gradient = candidate, gradient
             if self._is_best(candidate):
                 run.best[candidate.stage] = candidate
         run.stage_state = self.state()
@@ -407,7 +367,7 @@ class _StageRun:
             return True
         if not self.stage.solid:
             return item.objective > best.objective
-        if self.stage.audited and np.isnan(item.audited):
+        if self.stage.refined and np.isnan(item.refined):
             return False
         return _order(item) > _order(best)
 
@@ -427,7 +387,7 @@ class _StageRun:
         """Why the stage ends after its last evaluation, or nothing."""
         settings = self.run.settings
         if self.failures:
-            none_ran = self.farthest is None
+            none_ran = self.incumbent is None
             if self.failures >= settings.most_failures or (none_ran and self.failures > HALVINGS):
                 return f"it gave up after {self.failures} failed evaluations in a row."
             return ""

@@ -345,7 +345,7 @@ def minimize(
     rounding = 4 * EPSILON * np.maximum(np.abs(mma.lower), np.abs(mma.upper))
     inside = np.clip(x, mma.lower, mma.upper)
     x = np.where(np.abs(x - inside) <= rounding, inside, x)
-    mma.refuse_outside("x0", x)
+    mma.check_within("x0", x)
     if isinstance(constraints, LinearConstraint | NonlinearConstraint | Mapping):
         constraints = [constraints]
     try:

@@ -39,7 +39,7 @@ ELASTIC_COST = 1e3  # c_i of [3], for functions scaled to gradients of size one
 INNER_ITERATIONS = 30  # of the globally convergent variant; convexity grows up to 10 times in each
 PRECISION = 1e-12  # of the subproblem's solution, relative to the change over one step
 HOPELESS = 1e-8  # a constraint whose gradient is so much smaller than its value loses weight
-TINY = 1e-150  # gradients below would overflow in quotients
+LEAST_GRADIENT = 1e-150  # gradients below would overflow in quotients
 EPSILON = float(np.finfo(np.float64).eps)
 
 
@@ -222,7 +222,7 @@ class MovingAsymptotes:
         self._check_parameters()
         n = self.lower.size
         x = checked("x", x, (n,), "start from a finite x")
-        self.refuse_outside("x", x)
+        self.check_within("x", x)
         if (g is None) != (dgdx is None):
             raise MMAError("g and dgdx belong together: pass both or none")
         if g is None or dgdx is None:
@@ -245,7 +245,7 @@ class MovingAsymptotes:
         scale = np.where(seen > 0, seen, 1.0)
         # A constraint is measured by its gradient at x: one seen long ago may be larger by any
         # factor. One that no step within the bounds can meet must not hinder the rest.
-        scale[1:] = np.maximum(size, np.maximum(HOPELESS * np.abs(values), TINY))[1:]
+        scale[1:] = np.maximum(size, np.maximum(HOPELESS * np.abs(values), LEAST_GRADIENT))[1:]
 
         all_distances = self._next_distance(x)
         distance = all_distances[free]
@@ -322,7 +322,7 @@ class MovingAsymptotes:
         by_largest = max(_projected(below, lagrangian / largest), gap / largest)
         return min(by_gradient, max(by_largest, moved**2, newton**2))
 
-    def refuse_outside(self, name: str, x: Array) -> None:
+    def check_within(self, name: str, x: Array) -> None:
         """Refuse an x (n,) that is not within the bounds."""
         outside = np.maximum(self.lower - x, x - self.upper)
         if np.any(outside > 0):

@@ -8,7 +8,7 @@ from mpmopt.optimisation.settings import Settings, Stage
 def _sharpening(time_step: float, stages: int, coarsening: int = 1) -> tuple[Stage, ...]:
     """Beta doubled from 0.5; from 8 on, clear void is left out and designs are judged solid.
 
-    On the scene's own cells they count with the least of their audit.
+    On the scene's own cells they count with the least of their refinement study.
     """
     return tuple(
         Stage(
@@ -17,7 +17,7 @@ def _sharpening(time_step: float, stages: int, coarsening: int = 1) -> tuple[Sta
             void_stiffness=1e-3,
             time_step=time_step,
             solid=k >= 4,
-            audited=k >= 4 and coarsening == 1,
+            refined=k >= 4 and coarsening == 1,
             coarsening=coarsening,
             void_cutoff=0.05 if k >= 4 else 0.0,
         )
@@ -33,10 +33,10 @@ def continuation(time_step: float) -> Settings:
 def coarse_to_fine(coarse_time_step: float, time_step: float) -> Settings:
     """Cells twice as wide find the gait, then the scene's own find the shape.
 
-    The coarse stages are the first five of `continuation`; four starts, whose signals are a quarter
-    turn apart, scout three of them. The fine ones begin at beta = 8 and stay at 16 and 32 for
-    several stages: each begins with long moves again, which shake the design out of what it got
-    stuck in. Their void has a void density of 1e-2, and what is clear void is left out.
+    The coarse stages are the first five of `continuation`. The fine ones begin at beta = 8 and stay
+    at 16 and 32 for several stages: each begins with long moves again, which shake the design out
+    of what it got stuck in. Their void has a void density of 1e-2, and what is clear void is left
+    out.
     """
     coarse = _sharpening(coarse_time_step, stages=5, coarsening=2)
     fine = tuple(
@@ -46,14 +46,14 @@ def coarse_to_fine(coarse_time_step: float, time_step: float) -> Settings:
             void_stiffness=1e-3,
             time_step=time_step,
             solid=True,
-            audited=True,
+            refined=True,
             move_limit=move_limit,
             void_cutoff=0.05,
         )
         for beta, move_limit, repeats in ((8.0, 0.05, 1), (16.0, 0.05, 4), (32.0, 0.025, 3))
         for _ in range(repeats)
     )
-    return Settings((*coarse, *fine), most_iterations=25, tolerance=0.0, scouting=3)
+    return Settings((*coarse, *fine), most_iterations=25, tolerance=0.0)
 
 
 def paper_preset(time_step: float) -> Settings:

@@ -31,9 +31,9 @@ class Stage:
     time_step : float
     solid : bool
         Whether the best design is the one that goes farthest once its void is removed
-        (`threshold.post_processed`), which costs a forward run more, instead of as it is. The climb
-        itself goes on from the one that goes farthest as it is.
-    audited : bool
+        (`threshold.post_processed`), which costs a forward run more, instead of as it is. The
+        ascent goes on from the one that goes farthest as it is.
+    refined : bool
         Whether such a design counts with the least of this and of the same with half the step and
         with cells half as wide (`refinement.least`), so that the best is one that keeps its gain.
         This costs four gradients more for each design that goes farther than the best so far.
@@ -62,7 +62,7 @@ class Stage:
     void_stiffness: float
     time_step: float
     solid: bool = False
-    audited: bool = False
+    refined: bool = False
     coarsening: int = 1
     move_limit: float = 0.05
     void_cutoff: float = 0.0
@@ -79,11 +79,11 @@ class Stage:
                 raise DesignError(f"Stage: {name} = {getattr(self, name)} must be at most 1")
         void_cutoff = share("Stage", "void_cutoff", self.void_cutoff, error=DesignError)
         object.__setattr__(self, "void_cutoff", void_cutoff)
-        for name in ("solid", "audited", "limited"):
+        for name in ("solid", "refined", "limited"):
             value = flag("Stage", name, getattr(self, name), error=DesignError)
             object.__setattr__(self, name, value)
-        if self.audited and not self.solid:
-            raise DesignError("Stage: audited = True needs solid = True")
+        if self.refined and not self.solid:
+            raise DesignError("Stage: refined = True needs solid = True")
         if self.most_iterations is not None:
             most = count("Stage", "most_iterations", self.most_iterations, 1, error=DesignError)
             object.__setattr__(self, "most_iterations", most)
@@ -146,8 +146,6 @@ class Settings:
         Successful evaluations of a stage.
     most_failures : int
         Failed evaluations in a row after which the optimisation gives up.
-    scouting : int
-        Of several starts, each goes through so many of the first stages; then the best goes on.
 
     Raises
     ------
@@ -164,7 +162,6 @@ class Settings:
     least_iterations: int | None = None
     most_iterations: int = 200
     most_failures: int = 8
-    scouting: int = 0
 
     def __post_init__(self) -> None:
         given: Any = self.stages
@@ -180,12 +177,6 @@ class Settings:
             if name != "least_iterations" or given is not None:
                 given = count("Settings", name, given, 1, error=DesignError)
                 object.__setattr__(self, name, given)
-        scouting = count("Settings", "scouting", self.scouting, 0, error=DesignError)
-        object.__setattr__(self, "scouting", scouting)
-        if scouting > len(self.stages):
-            raise DesignError(
-                f"Settings: scouting = {scouting} is above the number of stages {len(self.stages)}"
-            )
         tolerance = number("Settings", "tolerance", self.tolerance, error=DesignError)
         object.__setattr__(self, "tolerance", tolerance)
         if self.least > self.most_iterations:

@@ -1,16 +1,16 @@
 """The one file that a run leaves: scene, settings, versions, history and designs, in HDF5.
 
-Layout (version 4)::
+Layout (version 5)::
 
-    attributes       format, version, leg (the start that goes on), stop_reason; as JSON:
-                     scene, settings, versions, summary
+    attributes       format, version, stage, reason, gave_up, stop_reason; as JSON: scene,
+                     settings, versions, summary
+    x                the design that the stage began with
     history/NAME     one entry per evaluation: objective, beta, non_discreteness, step, ...
     best/            the best of all, with gamma, phi, a, theta, b; attribute stage
-    legs/L/          start L: the design x that its stage began with; attributes stage, reason, ...
-    legs/L/stages/K/ its best design of stage K: x, gamma; attributes of its evaluation
+    stages/K/        the best design of stage K: x, gamma; attributes of its evaluation
     first/, last/    the first and the last evaluation, in the same way
     stage/           a stage that is under way: what its next step depends on
-    drawing/C        which particles of a drawn design are there, with C cells of the scene in one
+    baseline/C       which particles the baseline design has, with C cells of the scene in one
 
 The file is sealed with a digest of all its bytes (`checksums`).
 """
@@ -35,14 +35,16 @@ from mpmopt.design.problem import Variables
 from mpmopt.errors import RunFileError, StorageError
 from mpmopt.io.checksums import LARGEST, SEAL, file_in_memory, refusing, sealed, unsealed
 from mpmopt.io.files import replace_file
-from mpmopt.optimisation.history import Candidate, Iteration, Leg, Optimisation, StageState
+from mpmopt.optimisation.history import Candidate, Iteration, Optimisation, StageState
 from mpmopt.optimisation.settings import Settings
 from mpmopt.scene import Scene
 from mpmopt.validation import instance, place
 
-FORMAT, VERSION = "mpmopt run", 4
+FORMAT, VERSION = "mpmopt run", 5
 WHOLE = tuple(f.name for f in dataclasses.fields(Iteration) if f.type == "int")
 COLUMNS = tuple(f.name for f in dataclasses.fields(Iteration) if f.type in ("int", "float"))
+
+PLACE = ("stage", "reason", "gave_up", "stop_reason")  # where a run stands
 
 
 @dataclass(frozen=True)
@@ -57,22 +59,22 @@ class RunFile:
         Of this package and of those it computes with.
     summary : dict
         That of `summary.summarise`; empty if there is none yet.
-    drawing : dict of int to (D,) array of bool
-        Which design particles a design drawn by hand has, for each coarsening of the stages; empty
+    baseline : dict of int to (D,) array of bool
+        Which design particles the baseline design has, for each coarsening of the stages; empty
         if there is none.
     """
 
     run: Optimisation
     versions: dict[str, str]
     summary: dict[str, Any] = field(default_factory=dict)
-    drawing: dict[int, NDArray[np.bool_]] = field(default_factory=dict, repr=False)
+    baseline: dict[int, NDArray[np.bool_]] = field(default_factory=dict, repr=False)
 
 
 def write(
     path: str | os.PathLike[str],
     run: Optimisation,
     summary: Mapping[str, Any] | None = None,
-    drawing: Mapping[int, NDArray[np.bool_]] | None = None,
+    baseline: Mapping[int, NDArray[np.bool_]] | None = None,
 ) -> None:
     """Write a run as it stands; an older file of that name is replaced only by a complete one.
 
@@ -82,7 +84,7 @@ def write(
     run : Optimisation
     summary : mapping, optional
         Of a finished run.
-    drawing : mapping of int to (D,) array of bool, optional
+    baseline : mapping of int to (D,) array of bool, optional
         As in `RunFile`.
 
     Raises
@@ -95,14 +97,14 @@ def write(
     with file_in_memory() as file:
         _fill(file, run)
         file.attrs["summary"] = json.dumps(dict(summary or {}))
-        for coarsening, there in (drawing or {}).items():
-            file.create_dataset(f"drawing/{coarsening}", data=there, dtype="?")
+        for coarsening, there in (baseline or {}).items():
+            file.create_dataset(f"baseline/{coarsening}", data=there, dtype="?")
         file.flush()
         image = file.id.get_file_image()
     if len(image) + SEAL > LARGEST:
         raise StorageError(
             f"{path} would have {len(image):.3g} bytes, more than {LARGEST:.0e}, which nothing "
-            "reads back; take fewer stages or starts, or fewer particles"
+            "reads back; take fewer stages or fewer particles"
         )
     replace_file(path, sealed(image))
 
@@ -112,21 +114,17 @@ def _fill(file: h5py.File, run: Optimisation) -> None:
     file.attrs["scene"] = run.scene.to_json()
     file.attrs["settings"] = json.dumps(dataclasses.asdict(run.settings))
     file.attrs["versions"] = json.dumps(versions())
-    file.attrs["stop_reason"] = run.stop_reason
-    file.attrs["leg"] = run.leg
+    for name in PLACE:
+        file.attrs[name] = getattr(run, name)
+    file.create_dataset("x", data=run.x, dtype="f8")
+    for stage, item in run.best.items():
+        _write_candidate(file, f"stages/{stage}", item)
     for name in COLUMNS:
         column = np.array([getattr(item, name) for item in run.history], dtype=float)
         file.create_dataset(f"history/{name}", data=column, dtype="f8")
     file.create_dataset(
         "history/failure", data=[i.failure for i in run.history], dtype=h5py.string_dtype()
     )
-    for number, leg in enumerate(run.legs):
-        group = file.create_group(f"legs/{number}")
-        group.create_dataset("x", data=leg.x, dtype="f8")
-        for name in ("start", "stage", "reason", "gave_up"):
-            group.attrs[name] = getattr(leg, name)
-        for stage, item in leg.best.items():
-            _write_candidate(group, f"stages/{stage}", item)
     for name in ("first", "last"):
         _write_candidate(file, name, getattr(run, name))
     if run.stage_state is not None:
@@ -151,9 +149,9 @@ def _write_candidate(parent: h5py.Group, name: str, item: Candidate | None) -> N
 
 def _write_stage(group: h5py.Group, state: StageState) -> None:
     group.attrs["time_step"], group.attrs["failures"] = state.time_step, state.failures
-    for name in ("values", "gradient", "farthest_gradient"):
+    for name in ("values", "gradient", "incumbent_gradient"):
         group.create_dataset(name, data=getattr(state, name), dtype="f8")
-    _write_candidate(group, "farthest", state.farthest)
+    _write_candidate(group, "incumbent", state.incumbent)
     for name, value in state.mma.items():
         group.create_dataset(f"mma/{name}", data=value, dtype="f8")
 
@@ -199,26 +197,27 @@ def _read(file: h5py.File, path: Path) -> RunFile:
             f"{VERSION}; its versions: {file.attrs.get('versions')}"
         )
     settings = Settings.from_dict(json.loads(file.attrs["settings"]))
-    stages = len(settings.stages)
-    legs = [_read_leg(file[f"legs/{number}"], stages) for number in range(len(file["legs"]))]
     run = Optimisation(
         scene=Scene.from_json(file.attrs["scene"]),
         settings=settings,
-        legs=legs,
-        leg=int(file.attrs["leg"]),
+        x=_numbers(file, "x"),
+        stage=int(file.attrs["stage"]),
+        reason=str(file.attrs["reason"]),
+        gave_up=bool(file.attrs["gave_up"]),
+        best=_read_best(file.get("stages", {}), len(settings.stages)),
         history=_read_history(file["history"]),
         first=_read_candidate(file, "first"),
         last=_read_candidate(file, "last"),
         stage_state=_read_stage(file["stage"]) if "stage" in file else None,
         stop_reason=str(file.attrs["stop_reason"]),
     )
-    if not 0 <= run.leg < len(legs):
-        raise ValueError(f"leg {run.leg} of {len(legs)}")
+    if not 0 <= run.stage <= len(settings.stages):
+        raise ValueError(f"stage {run.stage} of {len(settings.stages)}")
     return RunFile(
         run,
         versions=json.loads(file.attrs["versions"]),
         summary=dict(json.loads(file.attrs["summary"])),
-        drawing={int(name): item[:] for name, item in file.get("drawing", {}).items()},
+        baseline={int(name): item[:] for name, item in file.get("baseline", {}).items()},
     )
 
 
@@ -232,22 +231,14 @@ def _read_history(group: h5py.Group) -> list[Iteration]:
     return [Iteration(**dict(zip(columns, row))) for row in zip(*columns.values())]
 
 
-def _read_leg(group: h5py.Group, stages: int) -> Leg:
+def _read_best(group: h5py.Group, stages: int) -> dict[int, Candidate]:
     best = {}
-    for name in sorted(group.get("stages", ()), key=int):
-        item = _read_candidate(group["stages"], name)
+    for name in sorted(group, key=int):
+        item = _read_candidate(group, name)
         if item is None or item.stage != int(name) or not 0 <= item.stage < stages:
             raise ValueError(f"a design of stage {name} of {stages}")
         best[item.stage] = item
-    attributes = group.attrs
-    return Leg(
-        start=int(attributes["start"]),
-        x=_numbers(group, "x"),
-        stage=int(attributes["stage"]),
-        reason=str(attributes["reason"]),
-        gave_up=bool(attributes["gave_up"]),
-        best=best,
-    )
+    return best
 
 
 def _read_candidate(parent: h5py.Group, name: str) -> Candidate | None:
@@ -268,12 +259,14 @@ def _read_stage(group: h5py.Group) -> StageState:
         failures=int(group.attrs["failures"]),
         values=_numbers(group, "values"),
         gradient=_numbers(group, "gradient"),
-        farthest=_read_candidate(group, "farthest"),
-        farthest_gradient=_numbers(group, "farthest_gradient"),
+        incumbent=_read_candidate(group, "incumbent"),
+        incumbent_gradient=_numbers(group, "incumbent_gradient"),
         mma={name: item[()] for name, item in group["mma"].items()},
     )
-    farthest = 0 if state.farthest is None else state.farthest.x.size
-    if state.farthest_gradient.size != farthest or (state.gradient.size and not state.values.size):
+    incumbent = 0 if state.incumbent is None else state.incumbent.x.size
+    if state.incumbent_gradient.size != incumbent or (
+        state.gradient.size and not state.values.size
+    ):
         raise ValueError("a stage whose values, gradients and designs do not fit together")
     return state
 

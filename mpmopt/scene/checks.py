@@ -189,9 +189,10 @@ def check_stability(scene: Scene) -> None:
         )
     for actuator in scene.actuators:
         largest = LARGEST_SIGNAL * np.abs(np.linalg.eigvalsh(actuator.stress)).max()
-        if scene.material.lame_mu - largest <= 0.0:
+        bearable = scene.material.elliptic_limit
+        if bearable - largest <= 0.0:
             raise SceneError(
-                f"Scene: ellipticity can be lost: lame_mu = {scene.material.lame_mu:g}, but the "
-                f"actuation stress can reach -{largest:g} at a signal of "
-                f"{LARGEST_SIGNAL:g}; keep it below lame_mu"
+                f"Scene: ellipticity can be lost: the material bears actuation stresses above "
+                f"-{bearable:g}, but they can reach -{largest:g} at a signal of "
+                f"{LARGEST_SIGNAL:g}; take a weaker actuator or a stiffer material"
             )

@@ -75,6 +75,9 @@ class Material(Checked):
         Lame constants (stress).
     density : float
         Reference mass density.
+    viscosity : float
+        eta of the Kelvin-Voigt stress S = eta dE/dt (stress times time), of the second
+        Piola-Kirchhoff stress and the Green-Lagrange strain. Zero, as in the paper: none.
     void_stiffness, void_density : float
         Share of stiffness and of mass that a void particle (gamma = 0) keeps: the paper's
         epsilon, one number each.
@@ -83,15 +86,17 @@ class Material(Checked):
     lame_lambda: float = 10.0
     lame_mu: float = 10.0
     density: float = 1.0
+    viscosity: float = 0.0
     void_stiffness: float = 1e-3
     void_density: float = 1e-3
 
     def __post_init__(self) -> None:
         for name in ("lame_mu", "density", "void_stiffness", "void_density"):
             self._set(**{name: number("Material", name, getattr(self, name), above=0.0)})
-        self._set(lame_lambda=number("Material", "lame_lambda", self.lame_lambda))
-        if self.lame_lambda < 0.0:
-            raise SceneError(f"Material: lame_lambda = {self.lame_lambda!r} must not be negative")
+        for name in ("lame_lambda", "viscosity"):
+            self._set(**{name: number("Material", name, getattr(self, name))})
+            if getattr(self, name) < 0.0:
+                raise SceneError(f"Material: {name} = {getattr(self, name)!r} must not be negative")
         for name in ("void_stiffness", "void_density"):
             if getattr(self, name) > 1.0:
                 raise SceneError(f"Material: {name} = {getattr(self, name)!r} must be at most 1")
@@ -100,6 +105,28 @@ class Material(Checked):
     def wave_speed(self) -> float:
         """Speed of pressure waves, sqrt((lambda + 2 mu) / rho)."""
         return math.sqrt((self.lame_lambda + 2.0 * self.lame_mu) / self.density)
+
+    @property
+    def modulus(self) -> float:
+        """Stiffness 2 (lambda + mu) that an isolated particle at rest bounds the time step by."""
+        return 2.0 * (self.lame_mu + self.lame_lambda)
+
+    def largest_time_step(self, dx: float) -> float:
+        """Stability limit of an isolated particle at rest on cells of width dx.
+
+        dt = k / (a + sqrt(a^2 + 1)) with k = dx sqrt(rho / M) and a = k eta / (rho dx^2) (docs:
+        theory, "Step control"). The lightest particle counts: a void one where the void density is
+        below the void stiffness.
+        """
+        stiffest = max(1.0, self.void_stiffness / self.void_density)
+        elastic = dx * math.sqrt(self.density / (self.modulus * stiffest))
+        viscous = elastic * self.viscosity * stiffest / (self.density * dx**2)
+        return elastic / (viscous + math.sqrt(viscous**2 + 1.0))
+
+    @property
+    def elliptic_limit(self) -> float:
+        """Stress mu: actuation that squeezes by as much takes the law's ellipticity."""
+        return self.lame_mu
 
 
 @dataclass(frozen=True)

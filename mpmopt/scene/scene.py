@@ -205,14 +205,8 @@ class Scene(Checked):
 
     @property
     def largest_time_step(self) -> float:
-        """Stability limit dx sqrt(rho / (2 (mu + lambda))) of an isolated particle.
-
-        The lightest particle counts: a void one where the void density is below the void stiffness.
-        """
-        material = self.material
-        stiffness = 2.0 * (material.lame_mu + material.lame_lambda)
-        stiffest = max(1.0, material.void_stiffness / material.void_density)
-        return self.grid.dx * math.sqrt(material.density / (stiffness * stiffest))
+        """Stability limit of an isolated particle (`Material.largest_time_step`)."""
+        return self.material.largest_time_step(self.grid.dx)
 
     @property
     def courant(self) -> float:

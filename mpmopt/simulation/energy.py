@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mpmopt.kernels import energy, grips
+from mpmopt.kernels import energy, grips, plain, wave_modulus
 
 # The balance is struck once in so many steps, and at the end.
 LOOK = 64
@@ -14,7 +14,7 @@ LOOK = 64
 # the mean signal, its work is known to the square of that over twelve.
 SIGNAL_CHANGE = 0.2
 # Units in the last place that energies of few particles are off by, several times.
-ROUNDING = 64.0
+ENERGY_ULPS = 64.0
 
 
 class Balance:
@@ -43,12 +43,15 @@ class Balance:
         self._last: tuple[float, float] | None = None
         self._lowest, self._rise, self._turnover = math.inf, 0.0, 0.0
         # What is rounding only: of strains, and of positions in gravity.
-        modulus = float((data.volume.real * (data.lame_lambda.real + 2 * data.lame_mu.real)).sum())
+        constants = data.stiffness.real * data.constants
+        modulus = float((data.volume.real * plain(wave_modulus)(2.0, 0.0, constants)).sum())
         weight = float(data.mass.real.sum()) * math.hypot(
             parameters.gravity_x, parameters.gravity_y
         )
         height = parameters.dx * max(parameters.nodes_x, parameters.nodes_y)
-        self._rounding = ROUNDING * float(np.finfo(signal.dtype).eps) * (modulus + weight * height)
+        self._rounding = (
+            ENERGY_ULPS * float(np.finfo(signal.dtype).eps) * (modulus + weight * height)
+        )
 
     def follow(self, states: NDArray, first: int, last: int) -> None:
         """Take in steps `first` to `last`, whose states are in slots 0, 1, ..."""

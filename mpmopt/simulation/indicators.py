@@ -29,15 +29,15 @@ class Indicators(NamedTuple):
     Attributes
     ----------
     courant : float
-        Largest (dt / dx) sqrt(M / rho) with the stiffness M of the stretched particle. An isolated
-        particle is unstable above 1.
+        Largest (dt / dx) sqrt(M / rho) with the stiffness M of the stretched particle, more where
+        it is viscous (docs: theory, "Step control"). An isolated particle is unstable above 1.
     velocity_increment : float
         Largest dt |C|, the Frobenius norm. Below 1 no particle can be inverted by a step.
     jacobian : float
         Smallest J = det F.
     stretch : float
         Largest singular value of F among particles with half the solid's stiffness or more. Solid
-        is torn where it exceeds the particles per cell and direction by far.
+        is fractured where it exceeds the particles per cell and direction by far.
     energy : float
         Most that energy rose without work, as a share of what the run had to do with
         (`energy.Balance`). No law of motion allows any.

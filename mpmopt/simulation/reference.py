@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from mpmopt.kernels import parts, ungrouped
+from mpmopt.kernels import PARAMETERS, kirchhoff, parts, plain, ungrouped
 from mpmopt.scene import Scene
 from mpmopt.simulation.simulation import Simulation
 
@@ -31,10 +31,13 @@ def step(simulation: Simulation, state: NDArray, n: int) -> NDArray:
     """
     scene, data, count = simulation.scene, simulation.data, state.shape[1]
     dt, dx = scene.time_step, scene.grid.dx
-    constants = (data.volume, data.mass, data.lame_lambda, data.lame_mu)
-    V, m, la, mu = (ungrouped(values, 1, count)[0] for values in constants)
+    V, m, stiffness = (
+        ungrouped(values, 1, count)[0] for values in (data.volume, data.mass, data.stiffness)
+    )
+    constants = [stiffness * ungrouped(values, 1, count)[0] for values in data.constants]
     x, v, C, F = parts(state)
     I = np.eye(2)[:, :, None]  # noqa: E741
+    law, viscosity = plain(kirchhoff), constants[PARAMETERS.index("viscosity")]
 
     # deform
     F = product(I + dt * C, F)
@@ -46,7 +49,10 @@ def step(simulation: Simulation, state: NDArray, n: int) -> NDArray:
         there = simulation.particles.actuator == k
         sS = sS + simulation.signal[n, k] * there * np.array(actuator.stress)[:, :, None]
     FT = F.transpose(1, 0, 2)
-    tau = mu * (product(F, FT) - I) + la * np.log(J) * I + product(product(F, sS), FT)
+    xx, xy, yy = law(F.reshape(4, -1), np.log(J), constants)
+    B, D = product(F, FT), 0.5 * (C + C.transpose(1, 0, 2))
+    tau = np.array([[xx, xy], [xy, yy]]) + product(product(F, sS), FT)
+    tau = tau + viscosity * product(product(B, D), B)
     A = m * C - dt * V * (4.0 / dx**2) * tau
 
     # particle to grid

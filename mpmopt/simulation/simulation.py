@@ -45,15 +45,14 @@ class Gradient:
 
     Attributes
     ----------
-    density, lame_lambda, lame_mu : (N,) arrays
+    density, stiffness : (N,) arrays
     signal : (steps, K) array
     state : (12, N) array
         With respect to the initial state.
     """
 
     density: NDArray[np.float64]
-    lame_lambda: NDArray[np.float64]
-    lame_mu: NDArray[np.float64]
+    stiffness: NDArray[np.float64]
     signal: NDArray[np.float64]
     state: NDArray[np.float64]
 
@@ -67,8 +66,8 @@ class Simulation:
         Grid, time, walls, gravity, and the actuators' stresses.
     particles : Particles
         N of them.
-    density, lame_lambda, lame_mu : (N,) arrays
-        Real, or complex for the complex step.
+    density, stiffness : (N,) arrays
+        Mass density, and share of the solid's stiffness. Real, or complex for the complex step.
     signal : (steps, K) array
         Of the scene's K actuators; real or complex.
     state : (12, N) array, optional
@@ -87,8 +86,7 @@ class Simulation:
         scene: Scene,
         particles: Particles,
         density: NDArray,
-        lame_lambda: NDArray,
-        lame_mu: NDArray,
+        stiffness: NDArray,
         signal: NDArray,
         state: NDArray | None = None,
         precision: Precision = "double",
@@ -101,8 +99,7 @@ class Simulation:
             x[:], F[0, 0], F[1, 1] = particles.position.T, 1.0, 1.0
         shapes = {
             "density": (density, (count,)),
-            "lame_lambda": (lame_lambda, (count,)),
-            "lame_mu": (lame_mu, (count,)),
+            "stiffness": (stiffness, (count,)),
             "signal": (signal, (scene.steps, len(scene.actuators))),
             "state": (state, (kernels.STATE_SIZE, count)),
         }
@@ -118,7 +115,7 @@ class Simulation:
                 raise DesignError(f"{name} holds {np.sum(~np.isfinite(array))} values not finite")
         if count == 0:
             raise DesignError("the body has no particles")
-        dtype = np.result_type(density, lame_lambda, lame_mu, signal, state, float)
+        dtype = np.result_type(density, stiffness, signal, state, float)
         if precision == "single" and dtype.kind == "f":
             dtype = np.dtype(np.float32)
         if not np.real(density).min() > 0.0:
@@ -132,11 +129,14 @@ class Simulation:
         self.parameters = parameters_of(scene)._replace(mass_tolerance=mass_tolerance)
         actuator = kernels.grouped(particles.actuator)
         stress = [(S[0][0], S[0][1], S[1][1]) for S in (a.stress for a in scene.actuators)]
+        solid = [getattr(scene.material, name) for name in kernels.PARAMETERS]
+        constants = np.empty((len(solid), *actuator.shape), real)
+        constants[:] = np.reshape(solid, (-1, 1, 1))
         self.data = kernels.ParticleData(
             volume=kernels.grouped(particles.volume.astype(dtype), repeat=False),
             mass=kernels.grouped((particles.volume * density).astype(dtype), repeat=False),
-            lame_lambda=kernels.grouped(np.asarray(lame_lambda, dtype=dtype)),
-            lame_mu=kernels.grouped(np.asarray(lame_mu, dtype=dtype)),
+            stiffness=kernels.grouped(np.asarray(stiffness, dtype=dtype)),
+            constants=constants,
             active=np.any(actuator >= 0, axis=1),
             actuated=(actuator == np.arange(len(stress))[:, None, None]).astype(real),
             actuation_stress=np.array(stress, dtype=float).reshape(-1, 3),
@@ -213,15 +213,12 @@ class Simulation:
 
     def indicators(self, records: NDArray) -> Indicators:
         """Those of a state, as records of groups (`grouped`), but for energy and gap."""
-        solid = 0.5 * self.scene.material.lame_mu
-        found = kernels.indicators(
-            records, self.data, self.parameters, solid, 0, len(self.data.mass)
-        )
+        found = kernels.indicators(records, self.data, self.parameters, 0, len(self.data.mass))
         return Indicators(*(float(value) for value in found))
 
     def gap(self, records: NDArray) -> tuple[float, float, float]:
         """How near solid that was far apart comes in a state, and where (`kernels.closest`)."""
-        solid = self.data.lame_mu.real >= 0.5 * self.scene.material.lame_mu
+        solid = self.data.stiffness.real >= 0.5
         solid &= self.data.mass.real > 0.0  # others only fill their group
         reference = kernels.grouped(self.particles.position.T)
         found = kernels.closest(records, reference, solid, self.data, self.parameters)
@@ -359,12 +356,12 @@ class Forward:
             return len(self._memory.recomputed)
         return len(schedule.segments) - 1
 
-    def reverse(self, seeds: Mapping[int, NDArray[np.float64]]) -> Gradient:
+    def reverse(self, terminal_adjoints: Mapping[int, NDArray[np.float64]]) -> Gradient:
         """Go back through all steps from a function's derivatives by states.
 
         Parameters
         ----------
-        seeds : mapping of int to (12, N) array
+        terminal_adjoints : mapping of int to (12, N) array
             Derivatives by the states after so many steps, any of them from 0 to the last.
 
         Raises
@@ -382,17 +379,17 @@ class Forward:
         simulation, memory = self._simulation, self._memory
         schedule = self._checkpoints.schedule
         shape, dtype = simulation.initial.shape, simulation.initial.dtype
-        for step, seed in seeds.items():
-            if not 0 <= step <= schedule.steps or np.shape(seed) != shape:
+        for step, terminal in terminal_adjoints.items():
+            if not 0 <= step <= schedule.steps or np.shape(terminal) != shape:
                 raise DesignError(
-                    f"seeds has shape {np.shape(seed)} at step {step}, must have {shape} at steps "
-                    f"from 0 to {schedule.steps}"
+                    f"terminal_adjoints has shape {np.shape(terminal)} at step {step}, must have "
+                    f"{shape} at steps from 0 to {schedule.steps}"
                 )
         self._reversed = True
 
         def seed_of(step: int) -> NDArray:
-            seed = seeds[step] if step in seeds else np.zeros(shape)
-            return kernels.grouped(seed.astype(dtype), repeat=False)
+            terminal = terminal_adjoints[step] if step in terminal_adjoints else np.zeros(shape)
+            return kernels.grouped(terminal.astype(dtype), repeat=False)
 
         bar = seed_of(schedule.steps)
         data_bar = kernels.ParticleDataBar.zeros(len(simulation.data.mass), dtype)
@@ -405,7 +402,7 @@ class Forward:
             part_bar = np.zeros((memory.blocks, *signal_bar[first:last].shape), dtype)
             stop = last - first
             while stop > 0:
-                earlier = (step - first for step in seeds if step < first + stop)
+                earlier = (step - first for step in terminal_adjoints if step < first + stop)
                 start = max(0, stop - simulation.steps_per_call, *earlier)
                 in_parallel(
                     memory.blocks,
@@ -425,13 +422,12 @@ class Forward:
                     part_bar,
                 )
                 stop = start
-                if first + start in seeds:
+                if first + start in terminal_adjoints:
                     bar += seed_of(first + start)
             signal_bar[first:last] = part_bar.sum(axis=0)
         return Gradient(
             density=simulation.particles.volume * kernels.ungrouped(data_bar.mass, 1, shape[1])[0],
-            lame_lambda=kernels.ungrouped(data_bar.lame_lambda, 1, shape[1])[0],
-            lame_mu=kernels.ungrouped(data_bar.lame_mu, 1, shape[1])[0],
+            stiffness=kernels.ungrouped(data_bar.stiffness, 1, shape[1])[0],
             signal=signal_bar,
             state=kernels.ungrouped(bar, *shape),
         )

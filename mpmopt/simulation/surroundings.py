@@ -27,6 +27,7 @@ def parameters_of(scene: Scene) -> kernels.Parameters:
         ),
         mirror_axis=-1 if scene.mirror is None else scene.mirror.normal,
         mirror_node=0 if scene.mirror is None else round(scene.mirror.position / dx),
+        viscous=scene.material.viscosity > 0.0,
         keep=math.exp(-scene.time_step / scene.blend_time) if scene.blend_time else 0.0,
         mass_tolerance=0.0,
     )

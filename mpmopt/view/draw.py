@@ -201,8 +201,8 @@ def draw_history(axes: Axes, run: Optimisation) -> None:
     lines += other.plot(number, column("non_discreteness"), "C0-", lw=1, label="non_discreteness")
     other.set_ylim(0.0, 1.05)
     other.set_ylabel("non_discreteness")
-    stage, start, beta = (column(name) for name in ("stage", "start", "beta"))
-    changed = (np.diff(stage) != 0) | (np.diff(start) != 0)
+    stage, beta = column("stage"), column("beta")
+    changed = np.diff(stage) != 0
     for first in [0, *(np.flatnonzero(changed) + 1)]:
         axes.axvline(first + 0.5, color="0.7", lw=0.8)
         axes.annotate(

@@ -176,7 +176,7 @@ class Filmed:
 
 
 def film(path: Path, run: Optimisation, seconds: float | None = None) -> Filmed:
-    """Write a film of a run's best design, the same without grey, and the full block.
+    """Write a film of a run's best design, the same without grey, and the solid reference design.
 
     All have the best design's actuation. A body that cannot be simulated is left out, but for the
     best design itself.
