@@ -1,6 +1,6 @@
 """What kernels pass to each other: surroundings, particles, nodes, scratch."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -15,7 +15,7 @@ POSITION, VELOCITY, AFFINE, DEFORMATION = 0, 2, 4, 8
 PLACE_SIZE, GATHERED_SIZE = 6, 9
 AFFINE_BAR, VELOCITY_BAR, MASS_BAR, SLOPE = 0, 4, 6, 7
 COEFFICIENTS = 9  # records of a cell: its polynomial, by order along x and y
-NODE_SIZE = 4  # one record: momentum and mass (q_x, q_y, m, 0)
+NODE_SIZE = 4  # one record: momentum, mass and the layers' normal force (q_x, q_y, m, f_N)
 
 
 class Parts(NamedTuple):
@@ -36,7 +36,7 @@ def parts(state: NDArray) -> Parts:
 
 
 class Parameters(NamedTuple):
-    """What surrounds the body: time step, cell width, nodes per side, gravity and walls."""
+    """What surrounds the body: time step, cell width, nodes, gravity, walls and ground."""
 
     dt: float
     dx: float
@@ -46,6 +46,7 @@ class Parameters(NamedTuple):
     gravity_x: float
     gravity_y: float
     walls: NDArray[np.float64]  # (W, columns) as `contact` names them
+    ground: Any  # `ground.Ground`
     mirror_axis: int  # of the mirror plane's normal: 0 or 1; -1: no mirror
     mirror_node: int  # line of nodes that is the plane
     viscous: bool  # whether a material has a viscosity

@@ -1,5 +1,6 @@
-"""What is simulated: grid, time, material, body and walls."""
+"""What is simulated: grid, time, material, body, walls and ground."""
 
+from mpmopt.scene.ground import Ground
 from mpmopt.scene.parts import (
     Actuator,
     Design,
@@ -17,6 +18,7 @@ __all__ = [
     "Actuator",
     "Design",
     "Grid",
+    "Ground",
     "Material",
     "Mirror",
     "Region",

@@ -10,6 +10,7 @@ import numpy as np
 
 from mpmopt.errors import SceneError
 from mpmopt.scene.parts import Actuator, Design, Mirror, Region
+from mpmopt.validation import shown
 
 if TYPE_CHECKING:
     from mpmopt.scene.scene import Scene
@@ -177,6 +178,13 @@ def check_mirror(scene: Scene) -> None:
             raise SceneError(
                 f"{name}: the wall at {wall.axis} = {wall.position:g} has no mirror image at "
                 f"{image_wall.position:g}; add it"
+            )
+    for k, ground in enumerate(scene.ground):
+        mirrored = ground.image(mirror.normal, mirror.position)
+        if not any(other.same(mirrored) for other in scene.ground):
+            raise SceneError(
+                f"{name}: ground {k} has no mirror image, with points {shown(mirrored.points)}; "
+                "add it"
             )
 
 

@@ -15,6 +15,7 @@ from mpmopt.scene.checks import (
     check_stability,
     check_walls,
 )
+from mpmopt.scene.ground import Ground, Layer, check_ground
 from mpmopt.scene.parts import (
     Actuator,
     Checked,
@@ -52,6 +53,7 @@ class Scene(Checked):
     body : tuple of Region
         `Design`, `Solid` and `Actuator` rectangles that do not overlap.
     walls : tuple of Wall, optional
+    ground : tuple of Ground, optional
     material : Material, optional
     gravity : (float, float), optional
     direction : (float, float), optional
@@ -66,7 +68,7 @@ class Scene(Checked):
         convolution (`filter_passes`), so that designs do not depend on the grid. Zero is one pass,
         as in the paper.
     mirror : Mirror, optional
-        Plane about which all of the scene is symmetric. Body and walls are given whole.
+        Plane about which all of the scene is symmetric. Body, walls and ground are given whole.
     blend_time : float, optional
         Time tau in which particles lose what the transfer to the grid and back smooths away: they
         keep a share exp(-time_step / tau) of it in every step, so that damping is a rate and not
@@ -95,12 +97,13 @@ class Scene(Checked):
     mirror: Mirror | None = None
     blend_time: float = 0.0
     transient: float = 0.0
+    ground: tuple[Ground, ...] = ()
 
     def __post_init__(self) -> None:
         for name, kind in (("grid", Grid), ("material", Material)):
             if not isinstance(getattr(self, name), kind):
                 raise SceneError(f"Scene: {name} must be a {kind.__name__}")
-        for name, part in (("body", Region), ("walls", Wall)):
+        for name, part in (("body", Region), ("walls", Wall), ("ground", Ground)):
             value = getattr(self, name)
             if not isinstance(value, (tuple, list)) or not all(isinstance(v, part) for v in value):
                 raise SceneError(f"Scene: {name} must be a tuple of {part.__name__} objects")
@@ -157,6 +160,7 @@ class Scene(Checked):
         check_body(self)
         check_size(self)
         check_walls(self)
+        check_ground(self)
         check_mirror(self)
         check_stability(self)
 
@@ -169,6 +173,11 @@ class Scene(Checked):
             f"({'stick' if wall.friction == 'stick' else f'friction {wall.friction:g}'})"
             for wall in self.walls
         )
+        ground = "".join(
+            f"; on ground from {ground.points[0]} to {ground.points[-1]} (friction "
+            f"{ground.friction})"
+            for ground in self.ground
+        )
         mirror = ""
         if self.mirror is not None:
             mirror = f", symmetric about {self.mirror.axis} = {self.mirror.position:g}"
@@ -176,8 +185,8 @@ class Scene(Checked):
         return (
             f"Scene of {nx} x {ny} cells {self.grid.dx:g} wide, {self.steps} steps of "
             f"{self.time_step:g}: a body of regions {body}{mirror}; "
-            f"free where {walls or 'the grid is'}; gravity ({gx:g}, {gy:g}); to travel along "
-            f"({ex:g}, {ey:g}){f' after {self.transient:g}' if self.transient_steps else ''}"
+            f"free where {walls or 'the grid is'}{ground}; gravity ({gx:g}, {gy:g}); to travel "
+            f"along ({ex:g}, {ey:g}){f' after {self.transient:g}' if self.transient_steps else ''}"
         )
 
     def _repr_png_(self) -> bytes:
@@ -206,7 +215,21 @@ class Scene(Checked):
     @property
     def largest_time_step(self) -> float:
         """Stability limit of an isolated particle (`Material.largest_time_step`)."""
-        return self.material.largest_time_step(self.grid.dx)
+        layers = [layer.stiffness / layer.thickness for layer in self.layers]
+        return self.material.largest_time_step(self.grid.dx, max(layers, default=0.0))
+
+    @property
+    def layers(self) -> tuple[Layer, ...]:
+        """The layers of the ground, with numbers for all that follows from the scene."""
+        return tuple(Layer.of(ground, self) for ground in self.ground)
+
+    @property
+    def extent(self) -> Vector:
+        """Width and height of the body."""
+        corners = [region.lower for region in self.body], [region.upper for region in self.body]
+        return tuple(  # type: ignore[return-value]
+            max(c[k] for c in corners[1]) - min(c[k] for c in corners[0]) for k in (0, 1)
+        )
 
     @property
     def courant(self) -> float:

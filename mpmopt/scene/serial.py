@@ -8,6 +8,7 @@ from collections import Counter
 from typing import Any
 
 from mpmopt.errors import SceneError
+from mpmopt.scene.ground import Ground
 from mpmopt.scene.parts import Actuator, Design, Grid, Material, Mirror, Solid, Wall
 from mpmopt.validation import shown
 
@@ -53,13 +54,14 @@ def parsed(scene_type: type, text: str) -> Any:
         regions = []
         for item in _array("body", data["body"]):
             item = dict(_object("Region", item))
-            kind = item.pop("kind", None)
-            if not isinstance(kind, str) or kind not in kinds:
-                raise SceneError(f"Region: kind = {shown(kind)} must be one of {sorted(kinds)}")
-            regions.append(_build(kinds[kind], item))
+            name = item.pop("kind", None)
+            if not isinstance(name, str) or name not in kinds:
+                raise SceneError(f"Region: kind = {shown(name)} must be one of {sorted(kinds)}")
+            regions.append(_build(kinds[name], item))
         data["body"] = tuple(regions)
-    if "walls" in data:
-        data["walls"] = tuple(_build(Wall, item) for item in _array("walls", data["walls"]))
+    for name, kind in (("walls", Wall), ("ground", Ground)):
+        if name in data:
+            data[name] = tuple(_build(kind, item) for item in _array(name, data[name]))
     return _build(scene_type, data)
 
 

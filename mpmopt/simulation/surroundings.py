@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from mpmopt import kernels
-from mpmopt.kernels import contact
+from mpmopt.kernels import contact, ground
 from mpmopt.scene import Scene
 
 
@@ -25,9 +25,34 @@ def parameters_of(scene: Scene) -> kernels.Parameters:
         walls=np.array([wall.row(dx) for wall in scene.walls], dtype=float).reshape(
             -1, len(contact.COLUMNS)
         ),
+        ground=_ground_of(scene),
         mirror_axis=-1 if scene.mirror is None else scene.mirror.normal,
         mirror_node=0 if scene.mirror is None else round(scene.mirror.position / dx),
         viscous=scene.material.viscosity > 0.0,
         keep=math.exp(-scene.time_step / scene.blend_time) if scene.blend_time else 0.0,
         mass_tolerance=0.0,
     )
+
+
+def _ground_of(scene: Scene) -> ground.Ground:
+    """The scene's ground as the kernels see it."""
+    lines = [layer.line for layer in scene.layers]
+    rows = [
+        np.column_stack(
+            [line.start, line.along, line.low, line.high, line.corner[:-1], line.corner[1:]]
+        )
+        for line in lines
+    ]
+    layers = [layer[1:] for layer in scene.layers]
+    nodes_y = scene.grid.cells[1] + 1
+    nodes = (scene.grid.cells[0] + 1) * nodes_y if layers else 0
+    result = ground.Ground(
+        segments=np.concatenate([np.empty((0, ground.SEGMENT_SIZE)), *rows]),
+        first=np.cumsum([0, *map(len, rows)]),
+        layers=np.array(layers, dtype=float).reshape(-1, len(ground.LAYER)),
+        nodes=np.empty((nodes, ground.NODE_COLUMNS)),
+        clearance=np.empty(nodes),
+    )
+    if layers:
+        ground.tabulate(result, nodes_y, scene.grid.dx)
+    return result
