@@ -15,6 +15,7 @@ from mpmopt.design.step_control import LIMITS, check_indicators
 from mpmopt.errors import DesignError, SimulationError
 from mpmopt.scene import Scene
 from mpmopt.scene.particles import discretise
+from mpmopt.simulation.formulations import simulation_of
 from mpmopt.simulation.simulation import Simulation
 from mpmopt.validation import shown
 
@@ -62,7 +63,7 @@ def solid_body(
     particles = particles.subset(there)
     ones = np.ones(there.sum())
     material = scene.material
-    simulation = Simulation(
+    simulation = simulation_of(
         scene,
         particles,
         density=material.density * ones,

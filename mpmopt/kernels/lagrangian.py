@@ -39,8 +39,8 @@ from mpmopt.kernels.spline import taylor, taylor_adjoint
 
 # Below this J the logarithm goes on as its Taylor polynomial of order two, so that void may invert.
 LEAST_J = 0.25
-# Records of a pattern for a group: 6 of the derivative along x (orders (1, 0), (2, 0), (1, 1), (2, 1),
-# (1, 2), (2, 2) of a cell's polynomial), 6 along y (the same with x and y exchanged), 9 of the value.
+# Records of a pattern for a group: 6 of the derivative along x (orders (1, 0), (2, 0), (1, 1),
+# (2, 1), (1, 2), (2, 2) of a cell's polynomial), 6 along y (with x and y exchanged), 9 of the value.
 PATTERN_SIZE, VALUE = 21, 12
 # Cells whose middle is farther than this from the layers, in cells, have no particle in them.
 CLEAR = 3.0
@@ -128,11 +128,15 @@ def gradients_adjoint(moments, c, pattern, r, P, Q):
     for k in range(6):
         w = load(pattern, PATTERN_SIZE * r + k)
         order = (k % 2 + 1) * 3 + k // 2
-        add(moments, c + order, pack(total(w * p00), total(w * p10), total(w * q00), total(w * q10)))
+        add(
+            moments, c + order, pack(total(w * p00), total(w * p10), total(w * q00), total(w * q10))
+        )
     for k in range(6):
         w = load(pattern, PATTERN_SIZE * r + 6 + k)
         order = (k // 2) * 3 + k % 2 + 1
-        add(moments, c + order, pack(total(w * p01), total(w * p11), total(w * q01), total(w * q11)))
+        add(
+            moments, c + order, pack(total(w * p01), total(w * p11), total(w * q01), total(w * q11))
+        )
 
 
 @jit
@@ -221,7 +225,9 @@ def forces(cells, moments, lattice, signal):
                 g = cell * groups + r
                 F = gradients(cells, c, 0, pattern, r)
                 rate = gradients(cells, c, 2, pattern, r)
-                p00, p01, p10, p11 = solid_stress(F, rate, solid_constants(lattice, g), lattice.viscous)
+                p00, p01, p10, p11 = solid_stress(
+                    F, rate, solid_constants(lattice, g), lattice.viscous
+                )
                 share = -lattice.volume * load(lattice.stiffness, g)
                 p00, p01, p10, p11 = share * p00, share * p01, share * p10, share * p11
                 if lattice.active[g]:
@@ -252,7 +258,9 @@ def forces_adjoint(cells, cells_bar, moments, lattice, signal, bar, signal_bar):
                 rate = gradients(cells, c, 2, pattern, r)
                 q00, q01, q10, q11 = gradients(cells_bar, c, 0, pattern, r)
                 q00, q01, q10, q11 = -V * q00, -V * q01, -V * q10, -V * q11
-                p00, p01, p10, p11 = solid_stress(F, rate, solid_constants(lattice, g), lattice.viscous)
+                p00, p01, p10, p11 = solid_stress(
+                    F, rate, solid_constants(lattice, g), lattice.viscous
+                )
                 add(bar.stiffness, g, q00 * p00 + q01 * p01 + q10 * p10 + q11 * p11)
                 k = load(lattice.stiffness, g)
                 P_bar = k * q00, k * q01, k * q10, k * q11
@@ -300,7 +308,8 @@ def is_clear(cells, c, lattice):
 @jit
 def press(cells, moments, lattice):
     """Adds the layers' force b n and its size b, in lanes 0 to 2, to the moments of all cells."""
-    groups, pattern, layers = lattice.pattern.shape[0] // PATTERN_SIZE, lattice.pattern, lattice.ground.layers
+    groups, pattern = lattice.pattern.shape[0] // PATTERN_SIZE, lattice.pattern
+    layers = lattice.ground.layers
     for cell in range(lattice.columns * lattice.rows):
         c = COEFFICIENTS * cell
         if lattice.filled[cell] and not is_clear(cells, c, lattice):
@@ -314,7 +323,9 @@ def press(cells, moments, lattice):
                         for n in range(len(layers)):
                             d, nx, ny, _ = distance(x, y, lattice.ground, n)
                             if d.real < layers[n, THICKNESS]:
-                                b = bearing(d, layers[n, THICKNESS], layers[n, STIFFNESS] * capacity)
+                                b = bearing(
+                                    d, layers[n, THICKNESS], layers[n, STIFFNESS] * capacity
+                                )
                                 for order in range(COEFFICIENTS):
                                     w = pattern[PATTERN_SIZE * r + VALUE + order, k]
                                     moments[c + order, 0] += w * b * nx
@@ -324,8 +335,9 @@ def press(cells, moments, lattice):
 
 @jit
 def press_adjoint(cells, cells_bar, moments, lattice, bar):
-    """From polynomials of the adjoints of `press`: adds to moments of x_bar and to stiffness_bar."""
-    groups, pattern, layers = lattice.pattern.shape[0] // PATTERN_SIZE, lattice.pattern, lattice.ground.layers
+    """From polynomials of the adjoint of `press`: adds to moments of x_bar and stiffness_bar."""
+    groups, pattern = lattice.pattern.shape[0] // PATTERN_SIZE, lattice.pattern
+    layers = lattice.ground.layers
     for cell in range(lattice.columns * lattice.rows):
         c = COEFFICIENTS * cell
         if lattice.filled[cell] and not is_clear(cells, c, lattice):
@@ -348,7 +360,9 @@ def press_adjoint(cells, cells_bar, moments, lattice, bar):
                                 b_bar = force_bar + nx * qx + ny * qy
                                 d_bar, full_bar = bearing_adjoint(d, thickness, full, b_bar)
                                 x_bar, y_bar = distance_adjoint(nx, ny, bend, d_bar, b * qx, b * qy)
-                                bar.stiffness[g, k] += layers[n, STIFFNESS] * lattice.volume * full_bar
+                                bar.stiffness[g, k] += (
+                                    layers[n, STIFFNESS] * lattice.volume * full_bar
+                                )
                                 for order in range(COEFFICIENTS):
                                     w = pattern[PATTERN_SIZE * r + VALUE + order, k]
                                     moments[c + order, 0] += w * x_bar

@@ -25,8 +25,9 @@ from mpmopt.validation import shown
 class LagrangianSimulation(Simulation):
     """One body on its own lattice: for bodies that do not tear, at a fraction of the cost.
 
-    It takes what `Simulation` takes, begins at rest and undeformed, and gives particle states of the
-    same layout, whose affine velocity is zero. Its own state are nodes (M, 4): position, velocity.
+    It takes what `Simulation` takes, begins at rest and undeformed, and gives particle states of
+    the same layout, whose affine velocity is zero. Its own state are nodes (M, 4): position and
+    velocity.
     """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
@@ -152,9 +153,7 @@ class LagrangianSimulation(Simulation):
         position = N.T @ x_bar.T + Gx.T @ F_bar[:, 0].T + Gy.T @ F_bar[:, 1].T
         return np.concatenate([position, N.T @ v_bar.T], axis=1)
 
-    def _advance(
-        self, states: NDArray, pushes: NDArray, first: int, last: int, begin: int
-    ) -> None:
+    def _advance(self, states: NDArray, pushes: NDArray, first: int, last: int, begin: int) -> None:
         """Steps `first` to `last`; slots and signals are counted from step `begin`."""
         signal = self.signal[begin:]
         step = first
@@ -273,9 +272,7 @@ class _Watcher:
             if step in self._wanted and step not in self.states:
                 self.states[step] = self._simulation.particle_state(nodes)
             if step % LOOK == 0 or step == self._simulation.steps:
-                gap = self._simulation.gap(
-                    kernels.grouped(self._simulation.particle_state(nodes))
-                )
+                gap = self._simulation.gap(kernels.grouped(self._simulation.particle_state(nodes)))
                 seen = self._simulation.look(nodes)
                 self.seen = self.seen.join(seen._replace(gap=gap[0], gap_x=gap[1], gap_y=gap[2]))
 
@@ -301,9 +298,7 @@ class LagrangianForward(Forward):
         self._run = memory.runs
         schedule, dtype = checkpoints.schedule, simulation.start.dtype
         watcher = _Watcher(simulation, instants)
-        self._states = memory.take(
-            "nodes", (schedule.segment + 1, *simulation.start.shape), dtype
-        )
+        self._states = memory.take("nodes", (schedule.segment + 1, *simulation.start.shape), dtype)
         self._pushes = memory.take("pushes", (schedule.segment, simulation.nodes), dtype)
         self._states[0] = simulation.start
         for index, (first, last) in enumerate(schedule.segments):
