@@ -114,13 +114,19 @@ def kernel_mismatches(scene: Scene, seed: int = 0) -> dict[str, float]:
             "affine_velocity deformation mass stiffness signal",
         ),
         "p2g": (bench.p2g, bench.p2g_adjoint, "position velocity affine mass"),
-        "grid_update": (bench.grid_update, bench.grid_update_adjoint, "grid"),
+        "grid_update": (
+            bench.grid_update,
+            bench.grid_update_adjoint,
+            "grid" + " normal_force" * bool(scene.ground),
+        ),
         "g2p": (
             bench.g2p,
             bench.g2p_adjoint,
             "position node_velocity" + " velocity" * (bench.fields == 2),
         ),
     }
+    if scene.ground:
+        tests["press"] = bench.press, bench.press_adjoint, "position stiffness"
     if bench.fields == 2:
         tests["inertia"] = bench.inertia, bench.inertia_adjoint, "affine_velocity mass"
     result = {
@@ -130,7 +136,7 @@ def kernel_mismatches(scene: Scene, seed: int = 0) -> dict[str, float]:
         for name, (function, adjoint, keys) in tests.items()
     }
     if scene.mirror is not None:
-        grid = {"grid": rng.standard_normal((bench.nodes, 3))}
+        grid = {"grid": rng.standard_normal((bench.nodes, kernels.NODE_SIZE))}
         result["mirror"] = dot_product_mismatch(
             bench.mirror, lambda v, w: {"grid": bench.mirror(w)["grid"]}, grid, rng
         )
@@ -216,6 +222,9 @@ class _Bench:
         grid = self.p2g(self.inputs)["grid"]
         self.mass_grid = grid[:, 2]
         self.inputs["grid"] = np.stack(self.fields * [grid[grid[:, 2] > 0.0]])
+        self.inputs["normal_force"] = np.zeros(len(self.inputs["grid"][0]))
+        if scene.ground:
+            self.inputs["normal_force"] = self.press(self.inputs)["force"][self.mass_grid > 0.0]
 
     def _tile(self, records: NDArray) -> kernels.Tile:
         """Of all groups, located."""
@@ -356,13 +365,34 @@ class _Bench:
 
     def mirror(self, v: Arrays) -> Arrays:
         records = np.zeros((self.nodes, kernels.NODE_SIZE), v["grid"].dtype)
-        records[:, :3] = v["grid"]
+        records[:] = v["grid"]
         kernels.mirror(records, self.window, self.parameters)
-        return {"grid": records[:, :3]}
+        return {"grid": records}
+
+    def press(self, v: Arrays) -> Arrays:
+        """What the ground's layers give the nodes."""
+        dtype = np.result_type(*v.values()).type
+        state, data = self._state(v, dtype), self._data(v, dtype)
+        tile, cells = self._tile(state), np.zeros((9 * self.nodes, 4), dtype)
+        kernels.press(state, data, self.parameters, tile, cells, *self.all)
+        nodes = self._nodes(cells)
+        return {"momentum": nodes[:, :2], "force": nodes[:, 3]}
+
+    def press_adjoint(self, v: Arrays, w: Arrays) -> Arrays:
+        state, data = self._state(v, float), self._data(v, float)
+        tile, bar, data_bar = self._tile(state), np.zeros_like(state), self._data_bar()
+        nodes = np.zeros((self.nodes, kernels.NODE_SIZE))
+        nodes[:, :2], nodes[:, 3] = w["momentum"], w["force"]
+        cells = self._cells(nodes)
+        kernels.press_adjoint(state, data, self.parameters, tile, cells, bar, data_bar, *self.all)
+        stiffness = self._particles(data_bar.stiffness, 1)
+        return {"position": self._parts(bar).position, "stiffness": stiffness}
 
     def _grid(self, v: Arrays, dtype: type) -> NDArray:
         grid = np.zeros((self.fields, self.nodes, kernels.NODE_SIZE), dtype)
         grid[:, self.mass_grid > 0.0, :3] = v["grid"]
+        if "normal_force" in v:
+            grid[0, self.mass_grid > 0.0, 3] = v["normal_force"]
         return grid
 
     def grid_update(self, v: Arrays) -> Arrays:
@@ -378,7 +408,9 @@ class _Bench:
             kernels.grid_update_adjoint(
                 grid, self.window, self.parameters, w["velocity"], scratch.node_bar, column
             )
-        return {"grid": scratch.node_bar[:, self.mass_grid > 0.0, :3]}
+        node_bar = scratch.node_bar[:, self.mass_grid > 0.0]
+        result = {"grid": node_bar[..., :3], "normal_force": node_bar[0, :, 3]}
+        return {name: result[name] for name in v}
 
     def g2p(self, v: Arrays) -> Arrays:
         """With the blend, if the scene has one."""
@@ -571,13 +603,14 @@ def taylor_test(
 
 
 def contact_free(scene: Scene, steps: int = 200) -> Scene:
-    """The first steps of a scene without its walls and gravity, so that nothing is ever touched."""
+    """The first steps of a scene without walls, ground and gravity: nothing is ever touched."""
     no_walls: tuple[Wall, ...] = ()
     steps = min(steps, scene.steps)
     return dataclasses.replace(
         scene,
         steps=steps,
         walls=no_walls,
+        ground=(),
         gravity=(0.0, 0.0),
         transient=min(scene.transient, 0.5 * steps * scene.time_step),
     )

@@ -6,8 +6,9 @@ A step advances the particle states from t_n to t_n + dt (primes mark the new st
     stress       tau = mu (F'F'^T - I) + lambda ln J' I + s F' S F'^T
                  A   = m C - dt V c tau
     p2g          m_i = sum_p w_ip m,   q_i = sum_p w_ip (m v + A (x_i - x))
+    press        q_i += dt sum_p w_ip b n,  f_i = sum_p w_ip b,  b = gamma_k V kappa <1 - d/delta>
     mirror       adds the images across a plane of symmetry, if the scene has one
-    grid_update  u_i = wall(q_i / m_i + dt g), where m_i > 0
+    grid_update  u_i = wall(resistance(q_i / m_i + dt g, dt f_i / m_i)), where m_i > 0
     g2p          v'  = sum_i w_ip u_i,  C' = c sum_i w_ip u_i (x_i - x)^T,  x' = x + dt v'
     blend        v' += keep (v - sum_i w_ip u_i_old), if the scene asks for it
 
@@ -60,6 +61,7 @@ from mpmopt.kernels.deformation import deform, deform_adjoint
 from mpmopt.kernels.energy import energy, grips
 from mpmopt.kernels.grid import free_velocity, grid_update, grid_update_adjoint, mirror
 from mpmopt.kernels.indicators import indicators
+from mpmopt.kernels.layer import press, press_adjoint
 from mpmopt.kernels.material import PARAMETERS, kirchhoff, wave_modulus
 from mpmopt.kernels.overlap import closest
 from mpmopt.kernels.spline import (
@@ -135,6 +137,8 @@ __all__ = [
     "p2g_adjoint",
     "parts",
     "plain",
+    "press",
+    "press_adjoint",
     "stress",
     "stress_adjoint",
     "taylor",

@@ -9,6 +9,8 @@ from mpmopt.kernels.actuation import squeezed
 from mpmopt.kernels.arrays import AFFINE, POSITION, VELOCITY, at, components
 from mpmopt.kernels.compiler import loop_jit
 from mpmopt.kernels.deformation import midway
+from mpmopt.kernels.ground import STIFFNESS, THICKNESS, distance
+from mpmopt.kernels.layer import stored
 from mpmopt.kernels.material import constants_of_one, energy_density
 
 
@@ -17,7 +19,8 @@ def energy(state: NDArray, data: Any, parameters: Any) -> tuple[float, float]:
     """Kinetic and potential energy of a state, of records of groups of four particles.
 
     F is half a step behind the velocities, as `deform` uses the old ones, and x half a step ahead
-    of them; both are taken where the velocities are. Infinite if a particle is inverted.
+    of them; both are taken where the velocities are. Infinite if a particle is inverted. What the
+    ground's layers store is potential energy.
     """
     kinetic = potential = 0.0
     half, inertia = 0.5 * parameters.dt, 0.25 * parameters.dx * parameters.dx
@@ -38,6 +41,11 @@ def energy(state: NDArray, data: Any, parameters: Any) -> tuple[float, float]:
             potential += volume * energy_density(F, math.log(J), constants_of_one(data, g, k))
             potential -= mass * parameters.gravity_x * (x - half * u)
             potential -= mass * parameters.gravity_y * (y - half * v)
+            ground, share = parameters.ground, volume * float(data.stiffness[g, k].real)
+            for n in range(len(ground.layers)):
+                d, _, _, _ = distance(x - half * u, y - half * v, ground, n)
+                capacity = ground.layers[n, STIFFNESS] * share
+                potential += stored(d, ground.layers[n, THICKNESS], capacity)
     return kinetic, potential
 
 

@@ -2,6 +2,7 @@
 
 from mpmopt.kernels.compiler import jit
 from mpmopt.kernels.contact import wall, wall_adjoint
+from mpmopt.kernels.layer import contact_at, resistance, resistance_adjoint
 from mpmopt.kernels.simd import add, fused, load, nothing, store
 
 
@@ -9,7 +10,7 @@ from mpmopt.kernels.simd import add, fused, load, nothing, store
 def mirror(records, window, parameters):
     """Add to each node what the mirrored half puts there; this map is its own transpose.
 
-    Records of nodes are (q_x, q_y, m, 0). With R the reflection, a node and its image across the
+    Records of nodes are (q_x, q_y, m, f_N). With R the reflection, a node and its image across the
     plane become r + R r_image and R r + r_image.
     """
     if parameters.mirror_axis < 0:
@@ -23,7 +24,7 @@ def mirror(records, window, parameters):
         for k in range(count - plane):
             node = line * step + (plane + k) * stride
             image = line * step + (plane - k) * stride
-            for lane in range(3):
+            for lane in range(4):
                 sign = -1.0 if lane == normal else 1.0
                 folded = records[image, lane] + sign * records[node, lane]
                 records[image, lane] = folded
@@ -46,7 +47,7 @@ def add_blocks(parts, field, windows, window, a, nodes):
 
 @jit
 def free_velocity(grid, node, per_m, parameters):
-    """Velocity of a node from momentum, 1 / mass and gravity, before the walls."""
+    """Velocity of a node from momentum, 1 / mass and gravity, before ground and walls."""
     return (
         fused(grid[0, node, 0], per_m, parameters.dt * parameters.gravity_x),
         fused(grid[0, node, 1], per_m, parameters.dt * parameters.gravity_y),
@@ -55,7 +56,7 @@ def free_velocity(grid, node, per_m, parameters):
 
 @jit
 def grid_update(grid, window, parameters, velocity, a):
-    """Velocity of column a's nodes from momentum, gravity and walls; zero where no mass is."""
+    """Velocity of column a's nodes from momentum, gravity, ground and walls; zero without mass."""
     i0, j0, _, nj = window
     for b in range(nj):
         node = a * nj + b
@@ -63,6 +64,9 @@ def grid_update(grid, window, parameters, velocity, a):
         u = v = 0.0 * m
         if m.real > parameters.mass_tolerance:
             u, v = free_velocity(grid, node, 1.0 / m, parameters)
+            if grid[0, node, 3].real > 0.0:
+                push = parameters.dt * grid[0, node, 3] / m
+                u, v = resistance(u, v, push, contact_at(parameters, i0 + a, j0 + b))
             u, v = wall(i0 + a, j0 + b, u, v, parameters)
         velocity[0, 2 * node], velocity[0, 2 * node + 1] = u, v
         if parameters.keep > 0.0:
@@ -75,7 +79,7 @@ def grid_update(grid, window, parameters, velocity, a):
 
 @jit
 def grid_update_adjoint(grid, window, parameters, velocity_bar, node_bar, a):
-    """From velocity_bar of column a's nodes to their momentum_bar and mass_bar."""
+    """From velocity_bar of column a's nodes to their momentum_bar, mass_bar and f_N_bar."""
     i0, j0, _, nj = window
     for b in range(nj):
         node = a * nj + b
@@ -83,15 +87,24 @@ def grid_update_adjoint(grid, window, parameters, velocity_bar, node_bar, a):
         if m > parameters.mass_tolerance:
             per_m = 1.0 / m
             u, v = grid[0, node, 0] * per_m, grid[0, node, 1] * per_m
-            u_bar, v_bar = wall_adjoint(
-                i0 + a,
-                j0 + b,
-                *free_velocity(grid, node, per_m, parameters),
-                parameters,
-                velocity_bar[0, 2 * node],
-                velocity_bar[0, 2 * node + 1],
-            )
+            free_u, free_v = free_velocity(grid, node, per_m, parameters)
+            u_bar, v_bar = velocity_bar[0, 2 * node], velocity_bar[0, 2 * node + 1]
+            push = push_bar = 0.0 * m
+            if grid[0, node, 3] > 0.0:
+                push = parameters.dt * grid[0, node, 3] * per_m
+                contact = contact_at(parameters, i0 + a, j0 + b)
+                held = resistance(free_u, free_v, push, contact)
+                u_bar, v_bar = wall_adjoint(i0 + a, j0 + b, *held, parameters, u_bar, v_bar)
+                u_bar, v_bar, push_bar = resistance_adjoint(
+                    free_u, free_v, push, contact, u_bar, v_bar
+                )
+            else:
+                u_bar, v_bar = wall_adjoint(
+                    i0 + a, j0 + b, free_u, free_v, parameters, u_bar, v_bar
+                )
             momentum_bar(node_bar[0], node, u, v, per_m, u_bar, v_bar)
+            node_bar[0, node, 2] -= push_bar * push * per_m
+            node_bar[0, node, 3] = push_bar * parameters.dt * per_m
             if parameters.keep > 0.0:
                 per_m = 1.0 / grid[1, node, 2]
                 u, v = grid[1, node, 0] * per_m, grid[1, node, 1] * per_m

@@ -90,20 +90,35 @@ def is_clear(state, parameters, g):
     return clearance > 0.0 and within(rx * rx + ry * ry, -1.0, clearance * clearance)
 
 
+@jit
+def deepest(x, y, ground):
+    """The polyline that a place is the deepest in, the normal of that, and how far layers are."""
+    k, nx, ny, least, clearance = 0, 0.0, 0.0, math.inf, math.inf
+    for n in range(len(ground.layers)):
+        d, x_n, y_n, _ = distance(x, y, ground, n)
+        clearance = min(clearance, d - ground.layers[n, THICKNESS])
+        if d < least:
+            k, nx, ny, least = n, x_n, y_n, d
+    return k, nx, ny, clearance
+
+
 @loop_jit
 def tabulate(ground: Any, nodes_y: int, dx: float) -> None:
-    """Fill in the nodes' columns, of the ground that each is the deepest in, and clearances."""
+    """Fill in the nodes' columns, of the ground that each is the deepest in, and clearances.
+
+    Halfway between two sides a node takes the mean of their normals, as symmetry wants it.
+    """
+    step = 1e-8 * dx
     for node in range(len(ground.nodes)):
-        x, y, deepest = (node // nodes_y) * dx, (node % nodes_y) * dx, math.inf
-        ground.clearance[node] = math.inf
-        for k in range(len(ground.layers)):
-            d, nx, ny, _ = distance(x, y, ground, k)
-            clearance = d - ground.layers[k, THICKNESS]
-            ground.clearance[node] = min(ground.clearance[node], clearance)
-            if d < deepest:
-                deepest = d
-                ground.nodes[node, NODE_NORMAL] = nx
-                ground.nodes[node, NODE_NORMAL + 1] = ny
-                for column in range(3):
-                    value = ground.layers[k, FRICTION + column]
-                    ground.nodes[node, NODE_FRICTION + column] = value
+        x, y = (node // nodes_y) * dx, (node % nodes_y) * dx
+        k, nx, ny, ground.clearance[node] = deepest(x, y, ground)
+        mean_x = mean_y = 0.0
+        for sx, sy in ((-step, -step), (-step, step), (step, -step), (step, step)):
+            _, x_n, y_n, _ = deepest(x + sx, y + sy, ground)
+            mean_x, mean_y = mean_x + 0.25 * x_n, mean_y + 0.25 * y_n
+        length = math.sqrt(mean_x * mean_x + mean_y * mean_y)
+        if 0.1 < length < 1.0 - 1e-6:
+            nx, ny = mean_x / length, mean_y / length
+        ground.nodes[node, NODE_NORMAL], ground.nodes[node, NODE_NORMAL + 1] = nx, ny
+        for column in range(3):
+            ground.nodes[node, NODE_FRICTION + column] = ground.layers[k, FRICTION + column]

@@ -40,7 +40,7 @@ from mpmopt.kernels.spline import taylor, taylor_adjoint
 # Below this J the logarithm goes on as its Taylor polynomial of order two, so that void may invert.
 LEAST_J = 0.25
 # Records of a pattern for a group: 6 of the derivative along x (orders (1, 0), (2, 0), (1, 1),
-# (2, 1), (1, 2), (2, 2) of a cell's polynomial), 6 along y (with x and y exchanged), 9 of the value.
+# (2, 1), (1, 2), (2, 2) of a cell's polynomial), 6 along y (x and y exchanged), 9 of the value.
 PATTERN_SIZE, VALUE = 21, 12
 # Cells whose middle is farther than this from the layers, in cells, have no particle in them.
 CLEAR = 3.0

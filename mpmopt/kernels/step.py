@@ -5,6 +5,7 @@ from mpmopt.kernels.barrier import meet
 from mpmopt.kernels.compiler import loop_jit
 from mpmopt.kernels.deformation import deform, deform_adjoint, first_inverted
 from mpmopt.kernels.grid import add_blocks, grid_update, grid_update_adjoint, mirror
+from mpmopt.kernels.layer import press, press_adjoint
 from mpmopt.kernels.spline import (
     find_window,
     first_outside,
@@ -77,6 +78,8 @@ def advance(states, grids, windows, logs, first, last, data, parameters, signal,
                             else:
                                 inertia(old, data, parameters, tile, g0, g1)
                             p2g(old, data, tile, node_cells[field], g0, g1)
+                        if len(parameters.ground.layers) > 0:
+                            press(old, data, parameters, tile, node_cells[0], g0, g1)
                     for field in range(fields):
                         taylor_adjoint(node_cells[field], part, parts[k, field])
         if not meet(barrier_state, threads):
@@ -205,4 +208,6 @@ def advance_adjoint(states, grids, windows, logs, first, last, data, parameters,
                         )  # fmt: skip
                     else:
                         inertia_adjoint(old, data, tile, bar, data_bar, g0, g1)
+                if len(parameters.ground.layers) > 0:
+                    press_adjoint(old, data, parameters, tile, node_cells[0], bar, data_bar, g0, g1)
                 deform_adjoint(old, parameters, bar, g0, g1)

@@ -97,9 +97,9 @@ class Ground(Checked):
         self._set(**{name: value})
 
     @classmethod
-    def floor(cls, y: float, **others: Any) -> Ground:
+    def floor(cls, y: float, friction: float | Literal["stick"] = 0.5, **others: Any) -> Ground:
         """Level ground at a height y; the others are parameters of `Ground`."""
-        return cls(((0.0, y), (1.0, y)), **others)
+        return cls(((0.0, y), (1.0, y)), friction, **others)
 
     @classmethod
     def slope(cls, point: Vector, degrees: float, **others: Any) -> Ground:

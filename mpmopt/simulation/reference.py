@@ -72,10 +72,25 @@ def step(simulation: Simulation, state: NDArray, n: int) -> NDArray:
             np.add.at(q[k], (i, j), w_i * (m * v[k] + A[k, 0] * d[0] + A[k, 1] * d[1]))
             np.add.at(q_old[k], (i, j), w_i * m * (v[k] + C[k, 0] * d[0] + C[k, 1] * d[1]))
 
+    # the ground's layers to grid
+    force = np.zeros(nodes, state.dtype)
+    for layer in scene.layers:
+        depth, normal = layer.line.distance(x)
+        pushed = stiffness * V * layer.stiffness * (1.0 - depth / layer.thickness)
+        pushed = np.where(pushed.real > 0.0, pushed, 0.0)
+        for i, j, w_i, _d in stencil:
+            np.add.at(force, (i, j), w_i * pushed)
+            for k in (0, 1):
+                np.add.at(q[k], (i, j), w_i * dt * pushed * normal[k])
+
     # grid update
     u, u_old = np.zeros_like(q), np.zeros_like(q)
     for i, j in zip(*np.nonzero(mass.real > 0.0)):
         u[:, i, j] = q[:, i, j] / mass[i, j] + dt * np.array(scene.gravity)
+        if force[i, j].real > 0.0:
+            u[:, i, j] = resist(
+                scene, np.array([i, j]) * dx, u[:, i, j], dt * force[i, j] / mass[i, j]
+            )
         meet_walls(scene, np.array([i, j]) * dx, u[:, i, j])
         u_old[:, i, j] = q_old[:, i, j] / mass[i, j]
 
@@ -98,6 +113,27 @@ def spline(r: NDArray) -> NDArray:
     """Quadratic B-spline at distances r, in cells, from its middle."""
     r = np.where(r.real < 0.0, -r, r)
     return np.where(r.real < 0.5, 0.75 - r**2, np.where(r.real < 1.5, 0.5 * (1.5 - r) ** 2, 0.0))
+
+
+def resist(scene: Scene, place: NDArray[np.float64], u: NDArray, push: complex | float) -> NDArray:
+    """Velocity (2,) of a node at a place (2,) after friction and damping of the nearest ground.
+
+    The layer changes the node's speed by `push` along the normal.
+    """
+    ground = min(scene.layers, key=lambda layer: float(layer.line.distance(place)[0]))
+    _, n = ground.line.distance(place)
+    u_n = (u @ n) * n
+    u_t = u - u_n
+    kept = 0.0 * push
+    if ground.friction < np.inf:
+        # Coulomb, implicit: u' + c tau(u') = u, tau = x (2 - x) with x = u' / creeping, at most 1.
+        speed, c, creeping = np.sqrt(u_t @ u_t), ground.friction * push, ground.creeping_speed
+        if speed.real >= (c + creeping).real:
+            kept = 1.0 - c / speed
+        else:
+            b = creeping + 2.0 * c
+            kept = 2.0 * creeping / (b + np.sqrt(b**2 - 4.0 * c * speed))
+    return u_n / (1.0 + ground.damping * push) + u_t * kept
 
 
 def meet_walls(scene: Scene, place: NDArray[np.float64], u: NDArray) -> None:
