@@ -64,8 +64,9 @@ def reference_step(simulation, nodes, n):
         F = np.stack([Gx[p] @ x, Gy[p] @ x], axis=1)
         rate = np.stack([Gx[p] @ v, Gy[p] @ v], axis=1)
         J = np.linalg.det(F)
-        log, slope = math.log(J), 1.0 / J
-        if J < lagrangian.LEAST_J:
+        if J >= lagrangian.LEAST_J:
+            log, slope = math.log(J), 1.0 / J
+        else:
             off = J / lagrangian.LEAST_J - 1.0
             log = math.log(lagrangian.LEAST_J) + off - off**2 / 2
             slope = (1.0 - off) / lagrangian.LEAST_J
@@ -97,7 +98,7 @@ def test_a_step_is_what_its_equations_say(rng, per_cell):
     nodes[:, 2:] = rng.standard_normal((len(nodes), 2))
     nodes[simulation.lattice.mass == 0.0, 2:] = 0.0
     states, pushes = np.zeros((2, *nodes.shape)), np.zeros((1, len(nodes)))
-    states[0] = nodes
+    states[0] = nodes  # solid and void alike
     lagrangian.advance_lattice(states, pushes, 0, 1, simulation.lattice, simulation.signal)
     expected = reference_step(simulation, nodes, 0)
     assert np.abs(states[1] - expected).max() <= 1e-13 * np.abs(expected).max()
@@ -199,17 +200,32 @@ def test_a_free_body_keeps_its_momenta():
 
 
 def test_void_may_invert_and_the_gradient_stays_exact(rng):
+    # A heavy beam on a leg at one end falls through the void at the other.
+    c = C
     scene = lattice_scene(
-        ground=(), gravity=(0.0, -40.0), material=Material(void_density=1e-2, void_stiffness=1e-3),
-        steps=150,
+        ground=(), gravity=(0.0, 0.0), material=Material(void_density=1e-2, void_stiffness=1e-4),
+        time_step=2e-3, steps=100,
+        body=(
+            Design((3 * c, 4 * c), (5 * c, 7 * c)),
+            Actuator((5 * c, 4 * c), (7 * c, 7 * c), stress=((4.9, 0.0), (0.0, 0.0))),
+        ),
     )  # fmt: skip
     problem = Problem(scene, 8.0, halvings=0, limits=None)
-    designed = problem.particles.position[problem.particles.designed]
-    x = problem.join(np.where(designed[:, 0] < 5 * C, 1.0, -1.0), 1.0, -0.3, -0.9)
-    F = kernels.parts(problem.simulation(x).run(range(0, 151, 10))).deformation
+    x = problem.join(rng.uniform(-1.0, -0.8, int(problem.particles.designed.sum())), 1.0, 0.9, 0.0)
+    simulation = problem.simulation(x)
+    simulation.start[:, 2] = -60.0 * (simulation.start[:, 0] < 4 * c)
+    F = kernels.parts(simulation.run(range(0, 101, 5))).deformation
     J = F[:, 0, 0] * F[:, 1, 1] - F[:, 0, 1] * F[:, 1, 0]
     assert J.min() < lagrangian.LEAST_J
-    assert worst(complex_step_test(problem, x)) <= 1e-11
+    terminal = rng.standard_normal(simulation.initial.shape)
+    terminal[4:8] = 0.0
+    with simulation.checkpoints(Checkpointing()) as checkpoints:
+        gradient = simulation.forward(checkpoints).reverse({100: terminal})
+    direction = rng.standard_normal(simulation.start.shape)
+    moved = problem.simulation(x + 0j)
+    moved.start[:] = simulation.start + 1e-30j * direction
+    found = (terminal * moved.run()).sum().imag / 1e-30
+    assert found == pytest.approx((gradient.state * direction).sum(), rel=1e-10)
 
 
 def test_an_isolated_cell_is_stable_up_to_the_limit_and_not_far_beyond():
@@ -237,7 +253,7 @@ def test_an_isolated_cell_is_stable_up_to_the_limit_and_not_far_beyond():
         return failed >= 0 or not np.abs(states[-1] - simulation.start).max() < 1e-2 * C
 
     assert not grows(0.99)
-    assert grows(1.35)
+    assert grows(1.5)
 
 
 def test_both_formulations_walk_alike():

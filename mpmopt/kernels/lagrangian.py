@@ -121,6 +121,22 @@ def gradients(cells, c, first, pattern, r):
 
 
 @jit
+def gradient_adjoint(moments, c, pattern, r, P):
+    """Adds to lanes 0 and 1 of a cell's moments what `gradients` transposed gives of P."""
+    p00, p01, p10, p11 = P
+    for k in range(6):
+        w = load(pattern, PATTERN_SIZE * r + k)
+        order = c + (k % 2 + 1) * 3 + k // 2
+        moments[order, 0] += total(w * p00)
+        moments[order, 1] += total(w * p10)
+    for k in range(6):
+        w = load(pattern, PATTERN_SIZE * r + 6 + k)
+        order = c + (k // 2) * 3 + k % 2 + 1
+        moments[order, 0] += total(w * p01)
+        moments[order, 1] += total(w * p11)
+
+
+@jit
 def gradients_adjoint(moments, c, pattern, r, P, Q):
     """Adds to a cell's moments what `gradients` transposed gives of P in lanes 0, 1, Q in 2, 3."""
     p00, p01, p10, p11 = P
@@ -224,7 +240,9 @@ def forces(cells, moments, lattice, signal):
             for r in range(groups):
                 g = cell * groups + r
                 F = gradients(cells, c, 0, pattern, r)
-                rate = gradients(cells, c, 2, pattern, r)
+                rate = F  # which nothing asks for
+                if lattice.viscous:
+                    rate = gradients(cells, c, 2, pattern, r)
                 p00, p01, p10, p11 = solid_stress(
                     F, rate, solid_constants(lattice, g), lattice.viscous
                 )
@@ -236,9 +254,7 @@ def forces(cells, moments, lattice, signal):
                     V = lattice.volume
                     p00, p01 = p00 - V * (f00 * s00 + f01 * s01), p01 - V * (f00 * s01 + f01 * s11)
                     p10, p11 = p10 - V * (f10 * s00 + f11 * s01), p11 - V * (f10 * s01 + f11 * s11)
-                nothing = 0.0 * p00
-                none = nothing, nothing, nothing, nothing
-                gradients_adjoint(moments, c, pattern, r, (p00, p01, p10, p11), none)
+                gradient_adjoint(moments, c, pattern, r, (p00, p01, p10, p11))
 
 
 @jit
