@@ -93,7 +93,7 @@ def threads_and_schedules(steps: int, rounds: int) -> str:
     """One and two threads; states recomputed or kept."""
     problem, x = problem_of(128, steps)
     simulation = problem.simulation(x)
-    objective = problem.objective(simulation)
+    objective = Objective.of(problem.scene, simulation.particles)
     runs: dict[str, Run] = {}
     for number in (1, 2):
         runs[f"forward {number}"] = with_threads(number, simulation.run)
@@ -128,7 +128,7 @@ def sizes(quick: bool, rounds: int) -> str:
     for cells, steps in ((128, 1000), (256, 400), (512, 200), (1024, 60))[: 2 if quick else 4]:
         problem, x = problem_of(cells, steps)
         simulation = problem.simulation(x)
-        objective = problem.objective(simulation)
+        objective = Objective.of(problem.scene, simulation.particles)
         seconds = in_turns(
             {
                 str(number): with_threads(
@@ -198,7 +198,7 @@ def print_peak_memory(contestant: str, steps: int) -> None:
     """In the process that `peak_memory` starts."""
     problem, x = problem_of(128, steps)
     simulation = problem.simulation(x)
-    objective = problem.objective(simulation)
+    objective = Objective.of(problem.scene, simulation.particles)
     if contestant == "mpmopt":
         gradient_of(simulation, objective, Checkpointing())
     else:
@@ -213,7 +213,7 @@ def peers(steps: int, rounds: int) -> str:
     """The same scene in libraries for automatic differentiation, in double precision."""
     problem, x = problem_of(128, steps)
     simulation = problem.simulation(x)
-    objective = problem.objective(simulation)
+    objective = Objective.of(problem.scene, simulation.particles)
     value, ours = gradient_of(simulation, objective, Checkpointing())
     runs: dict[str, Run] = {
         "mpmopt forward": with_threads(2, simulation.run),

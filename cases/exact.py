@@ -7,7 +7,7 @@ import numpy as np
 from mpmopt import kernels
 from mpmopt.design.objective import Objective
 from mpmopt.scene import Grid, Material, Mirror, Scene, Solid
-from mpmopt.scene.particles import discretise
+from mpmopt.scene.particles import discretise, of_solid
 from mpmopt.simulation.checkpoints import Checkpointing
 from mpmopt.simulation.simulation import Simulation
 from mpmopt.simulation.surroundings import parameters_of
@@ -16,10 +16,9 @@ from mpmopt.simulation.surroundings import parameters_of
 def solid_simulation(scene, particles=None, state=None, precision="double"):
     particles = particles or discretise(scene)
     ones = np.ones(len(particles.position))
-    material = scene.material
     signal = np.zeros((scene.steps, len(scene.actuators)))
     return Simulation(
-        scene, particles, material.density * ones, ones, signal, state, precision
+        scene, particles, of_solid(scene, particles, "density"), ones, signal, state, precision
     )  # fmt: skip
 
 
@@ -49,6 +48,8 @@ class Bar:
     blend_time : float, optional
         As in `Scene`.
     precision : {"double", "single"}, optional
+    viscosity : float, optional
+        eta, which makes the middle move by `damped` times as much.
     """
 
     length = 25.0
@@ -57,14 +58,15 @@ class Bar:
     duration = 11.25  # periods: one and an eighth
 
     def __init__(
-        self, n, courant, per_cell=2, checkpointing=None, blend_time=0.0, precision="double"
-    ):
+        self, n, courant, per_cell=2, checkpointing=None, blend_time=0.0, precision="double",
+        viscosity=0.0,
+    ):  # fmt: skip
         dx = self.length / n
         free, held = 4 * dx, 4 * dx + self.length
         steps = math.ceil(self.duration * self.speed / dx / courant - 1e-6)
         scene = Scene(
             Grid((2 * n + 8, 10), dx), time_step=self.duration / steps, steps=steps,
-            material=Material(lame_lambda=0.0, lame_mu=self.speed**2 / 2.0),
+            material=Material(0.0, self.speed**2 / 2.0, viscosity=viscosity),
             body=(Solid((free, 4 * dx), (held + self.length, 6 * dx)),),
             particles_per_cell=per_cell, mirror=Mirror("x", held), direction=(0.0, 1.0),
             blend_time=blend_time,
@@ -72,6 +74,7 @@ class Bar:
         particles = discretise(scene)
         beta = math.pi / (2.0 * self.length)
         self.omega = beta * self.speed
+        self.decay = 0.5 * viscosity * beta**2  # of sigma = E strain + eta d(strain)/dt
         self.state = at_rest(particles)
         s = beta * (held - particles.position[:, 0])
         self.state[2] = -self.amplitude * np.sin(s)
@@ -88,6 +91,12 @@ class Bar:
         reach = self.amplitude / (2.0 * self.omega)
         travel = reach * math.sin(phase)
         return travel, np.array([0.5 * (reach * phase * math.cos(phase) - travel), travel])
+
+    def damped(self):
+        """Travel of the middle over what it would be without viscosity."""
+        omega = math.sqrt(self.omega**2 - self.decay**2)
+        swing = math.sin(omega * self.duration) / omega * math.exp(-self.decay * self.duration)
+        return swing / (math.sin(self.omega * self.duration) / self.omega)
 
     def value_and_gradient(self):
         """The same as simulated."""
@@ -164,7 +173,7 @@ def manufactured_error(n, amplitude, courant=0.2, per_cell=2):
         mirror(grid.reshape(side, side, 4), 0, n)
         mirror(grid.reshape(side, side, 4).transpose(1, 0, 2), 1, n)
         for column in range(side):
-            kernels.grid_update(nodes, window, parameters, velocity, column)
+            kernels.grid_update(nodes, window, parameters, parameters.clamps[0], velocity, column)
         kernels.taylor(velocity[0], window, window, velocity_cells)
         kernels.g2p(old, new, parameters, tile, velocity_cells, *every)
         old, new = new, old

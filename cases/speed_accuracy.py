@@ -40,6 +40,7 @@ from matplotlib.patches import Rectangle
 from mpmopt.app.sweeps import connected, results, sweep
 from mpmopt.assess.discretisation import Discretisation, Measured, density, measure, timed
 from mpmopt.design.actuation import signal_adjoint
+from mpmopt.design.objective import Objective
 from mpmopt.design.problem import Problem
 from mpmopt.errors import MpmoptError
 from mpmopt.scene import Scene
@@ -344,7 +345,7 @@ def print_peer(name: str, robot: str) -> None:
     problem = Problem(scene, BETA)
     x = design(phi)(problem)
     simulation = problem.simulation(x)
-    objective = problem.objective(simulation)
+    objective = Objective.of(problem.scene, simulation.particles)
     program = peer.prepare(simulation, objective)
     program.value_and_gradient()
     (value, bars), seconds = timed(program.value_and_gradient, 3)

@@ -16,7 +16,15 @@ _HOMES = {
     "Actuator": "mpmopt.scene",
     "Wall": "mpmopt.scene",
     "Mirror": "mpmopt.scene",
+    "SILICONES": "mpmopt.scene",
     "Problem": "mpmopt.design.problem",
+    "Task": "mpmopt.design.task",
+    "AtMost": "mpmopt.design.task",
+    "Displacement": "mpmopt.design.terms",
+    "Speed": "mpmopt.design.terms",
+    "Effort": "mpmopt.design.terms",
+    "Volume": "mpmopt.design.terms",
+    "OnePiece": "mpmopt.design.one_piece",
     "Settings": "mpmopt.optimisation.settings",
     "Stage": "mpmopt.optimisation.settings",
     "optimise": "mpmopt.optimisation.loop",
@@ -29,12 +37,20 @@ _HOMES = {
 if TYPE_CHECKING:
     from mpmopt.app.sweeps import sweep as sweep
     from mpmopt.assess.discretisation import cheapest as cheapest
+    from mpmopt.design.one_piece import OnePiece as OnePiece
     from mpmopt.design.problem import Problem as Problem
+    from mpmopt.design.task import AtMost as AtMost
+    from mpmopt.design.task import Task as Task
+    from mpmopt.design.terms import Displacement as Displacement
+    from mpmopt.design.terms import Effort as Effort
+    from mpmopt.design.terms import Speed as Speed
+    from mpmopt.design.terms import Volume as Volume
     from mpmopt.optimisation.loop import optimise as optimise
     from mpmopt.optimisation.minimize import minimize as minimize
     from mpmopt.optimisation.settings import Settings as Settings
     from mpmopt.optimisation.settings import Stage as Stage
     from mpmopt.results.runfile import read_run as read_run
+    from mpmopt.scene import SILICONES as SILICONES
     from mpmopt.scene import Actuator as Actuator
     from mpmopt.scene import Design as Design
     from mpmopt.scene import Grid as Grid

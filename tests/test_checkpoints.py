@@ -229,7 +229,9 @@ def test_going_back_twice_is_refused(rough_walker, every):
     simulation = problem.simulation(x)
     with simulation.checkpoints(Checkpointing(every)) as checkpoints:
         forward = simulation.forward(checkpoints)
-        terminal_adjoints = problem.objective(simulation).terminal_adjoints(forward.states)
+        terminal_adjoints = Objective.of(problem.scene, simulation.particles).terminal_adjoints(
+            forward.states
+        )
         forward.reverse(terminal_adjoints)
         with pytest.raises(DesignError, match="run forward again"):
             forward.reverse(terminal_adjoints)

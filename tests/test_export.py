@@ -21,6 +21,7 @@ from walker import walker
 from mpmopt.__main__ import main
 from mpmopt.assess.threshold import pieces, solid_body
 from mpmopt.design.problem import Problem
+from mpmopt.design.task import DEFAULT_TASK
 from mpmopt.errors import (
     DesignError,
     ExportError,
@@ -331,7 +332,7 @@ def test_the_motion_is_read_back_by_vtk(tmp_path, mirror):
     export(problem, x, tmp_path, ["vtk"])
     times, frames = read_motion(tmp_path / "motion.vtkhdf")
     assert times == pytest.approx(np.arange(41) * scene.time_step)
-    simulation, _ = solid_body(scene, problem.gamma(x) >= 0.3, problem.split(x))
+    simulation = solid_body(scene, problem.gamma(x) >= 0.3, problem.split(x))
     states = simulation.run(range(41))
     count = states.shape[2]
     spacing = scene.grid.dx / scene.particles_per_cell
@@ -446,7 +447,7 @@ def test_a_folder_that_cannot_be_made_is_a_storage_error(holed, tmp_path):
 def run_file(path, problem, x):
     """A run file with a design, as if it had been found."""
     stage = Stage(problem.chain.beta, 1e-2, 1e-3, problem.scene.time_step)
-    run = Optimisation(problem.scene, Settings((stage,)), x)
+    run = Optimisation(problem.scene, Settings((stage,)), DEFAULT_TASK, x)
     numbers: Any = dict.fromkeys(
         ("move_limit", "non_discreteness", "projected_gradient", "step"), 0.1
     )

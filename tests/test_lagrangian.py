@@ -200,11 +200,11 @@ def test_a_free_body_keeps_its_momenta():
 
 
 def test_void_may_invert_and_the_gradient_stays_exact(rng):
-    # A heavy beam on a leg at one end falls through the void at the other.
+    # The end of a block of void is thrown through the rest.
     c = C
     scene = lattice_scene(
         ground=(), gravity=(0.0, 0.0), material=Material(void_density=1e-2, void_stiffness=1e-4),
-        time_step=2e-3, steps=100,
+        time_step=2e-3, steps=60,
         body=(
             Design((3 * c, 4 * c), (5 * c, 7 * c)),
             Actuator((5 * c, 4 * c), (7 * c, 7 * c), stress=((4.9, 0.0), (0.0, 0.0))),
@@ -213,14 +213,14 @@ def test_void_may_invert_and_the_gradient_stays_exact(rng):
     problem = Problem(scene, 8.0, halvings=0, limits=None)
     x = problem.join(rng.uniform(-1.0, -0.8, int(problem.particles.designed.sum())), 1.0, 0.9, 0.0)
     simulation = problem.simulation(x)
-    simulation.start[:, 2] = -60.0 * (simulation.start[:, 0] < 4 * c)
-    F = kernels.parts(simulation.run(range(0, 101, 5))).deformation
+    simulation.start[:, 2] = 3.0 * (simulation.start[:, 0] < 3.6 * c)
+    F = kernels.parts(simulation.run(range(0, 61, 5))).deformation
     J = F[:, 0, 0] * F[:, 1, 1] - F[:, 0, 1] * F[:, 1, 0]
     assert J.min() < lagrangian.LEAST_J
     terminal = rng.standard_normal(simulation.initial.shape)
     terminal[4:8] = 0.0
     with simulation.checkpoints(Checkpointing()) as checkpoints:
-        gradient = simulation.forward(checkpoints).reverse({100: terminal})
+        gradient = simulation.forward(checkpoints).reverse({60: terminal})
     direction = rng.standard_normal(simulation.start.shape)
     moved = problem.simulation(x + 0j)
     moved.start[:] = simulation.start + 1e-30j * direction

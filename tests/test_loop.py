@@ -11,6 +11,7 @@ from walker import walker
 from mpmopt.assess import refinement
 from mpmopt.design import chain
 from mpmopt.design.problem import Problem
+from mpmopt.design.task import DEFAULT_TASK
 from mpmopt.errors import DesignError, SceneError, SimulationError
 from mpmopt.optimisation.history import Candidate, Optimisation
 from mpmopt.optimisation.loop import go_on, optimise
@@ -258,7 +259,7 @@ def test_the_result_is_never_a_design_that_no_refinement_saw_if_there_is_one(sce
     solid = dataclasses.replace(STAGES[0], solid=True)
     stages = (solid, dataclasses.replace(solid, refined=True))
     best = {0: candidate(0, 0.6, 0.55), 1: candidate(1, 0.6, 0.54, 0.5)}
-    run = Optimisation(scene, Settings(stages), np.zeros(1), best=best)
+    run = Optimisation(scene, Settings(stages), DEFAULT_TASK, np.zeros(1), best=best)
     assert run.result is best[1]
     best[1] = candidate(1, 0.6, 0.54, -np.inf)  # it has no refinement study that ran
     assert run.result is best[0]

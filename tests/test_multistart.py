@@ -163,7 +163,8 @@ def test_a_loss_is_not_scaled(tmp_path, monkeypatch):
 
     def refined():
         return multistart.one_start(
-            SCENE.to_json(), dataclasses.asdict(TINY.settings), dict(TINY.start), 0,
+            SCENE.to_json(), dataclasses.asdict(TINY.settings), dict(TINY.start),
+            TINY.task.to_json(), 0,
             baseline=slanted_legs, out=tmp_path,
         )["refined_gain"]  # fmt: skip
 

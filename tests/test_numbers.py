@@ -41,6 +41,7 @@ def three():
         volume=np.array([1.0, 3.0, 5.0]),
         designed=np.array([False, False, True]),
         actuator=np.array([0, -1, -1]),
+        region=np.array([0, 1, 2]),
     )
     state = np.zeros((12, 3))
     state[0], state[1] = (2.0, 4.0, 50.0), (1.0, 3.0, 70.0)

@@ -12,6 +12,7 @@ from mpmopt.assess.trajectory import Body, Motion
 from mpmopt.design.chain import DesignChain
 from mpmopt.design.objective import Objective
 from mpmopt.design.problem import Problem
+from mpmopt.design.terms import Displacement
 from mpmopt.errors import DesignError, SimulationError
 from mpmopt.optimisation.loop import optimise
 from mpmopt.scene.particles import Particles, discretise
@@ -145,17 +146,17 @@ def test_a_motion_and_a_design_that_is_carried_keep_their_own():
     problem = Problem(SCENE, 2.0)
     x = problem.join(0.3, 0.9, -0.3, -0.5)
     simulation, frames = problem.simulation(x), np.array([0, 6, 12])
-    objective = problem.objective(simulation)
+    objective, grey = Displacement(), np.full(32, 0.5)
     gamma = np.full(len(simulation.particles.position), 0.5)
-    motion = Motion.of(Body("a", simulation, gamma, objective), frames)
+    motion = Motion.of(Body("a", simulation, gamma, objective, grey), frames)
     design, wanted = carried(problem, x), x.copy()
-    spoil(gamma, frames, x)
+    spoil(gamma, frames, x, grey)
     assert motion.frames.tolist() == [0, 6, 12]
     assert set(motion.gamma) == {0.5}
     assert np.array_equal(design(problem), wanted)
     before = motion.objective.copy()
     spoil(*arrays(motion).values())
-    again = Motion.of(Body("a", simulation, np.ones(48), objective), [0, 6, 12])
+    again = Motion.of(Body("a", simulation, np.ones(48), objective, np.full(32, 0.5)), [0, 6, 12])
     assert np.array_equal(again.objective, before)
 
 

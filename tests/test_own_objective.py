@@ -10,18 +10,16 @@ from mpmopt.assess import refinement, threshold, trajectory
 from mpmopt.assess.discretisation import Discretisation, cheapest, measure
 from mpmopt.assess.trajectory import Motion
 from mpmopt.assess.verify import report
-from mpmopt.design.objective import Objective
 from mpmopt.design.problem import Problem
+from mpmopt.design.task import Task
+from mpmopt.design.terms import Displacement
 
 SCENE = small_scene(steps=16)
 UP = (0.6, 0.8)
 
 
-class Climber(Problem):
-    """Goes another way than its scene says."""
-
-    def objective(self, simulation):
-        return Objective.of(simulation.scene, simulation.particles, UP)
+# Another way than the scene says.
+OWN = Task(Displacement(UP))
 
 
 def smooth(problem):
@@ -31,8 +29,8 @@ def smooth(problem):
 
 @pytest.fixture
 def pair():
-    """The subclass, and the same by a scene."""
-    return Climber(SCENE, 2.0), Problem(replace(SCENE, direction=UP), 2.0)
+    """A task, and the same by a scene."""
+    return Problem(SCENE, 2.0, task=OWN), Problem(replace(SCENE, direction=UP), 2.0)
 
 
 def test_bodies_without_void_go_its_way(pair):
@@ -41,7 +39,7 @@ def test_bodies_without_void_go_its_way(pair):
         own, same = (distance(problem, x) for problem in pair)
         assert own == same
     block, split = threshold.solid_reference, pair[0].split(x)
-    own = threshold.best_actuated(SCENE, block, split, objective=pair[0].objective)
+    own = threshold.best_actuated(SCENE, block, split, task=OWN)
     assert own == threshold.best_actuated(pair[1].scene, block, split)
 
 
@@ -62,9 +60,9 @@ def test_checks_and_measurements_are_of_it(pair):
     complex_steps = [[c.value for c in checks if "complex" in c.name] for checks in (own, same)]
     assert complex_steps[0] == complex_steps[1]
     here = Discretisation.of(SCENE)
-    measured = measure(SCENE, here, smooth, 2.0, 1 / 16, kind=Climber)
+    measured = measure(SCENE, here, smooth, 2.0, 1 / 16, task=OWN)
     expected = measure(pair[1].scene, here, smooth, 2.0, 1 / 16)
     assert measured.travel == expected.travel
     assert np.array_equal(measured.gradient, expected.gradient)
-    found = cheapest(SCENE, x, 1e9, beta=2.0, kind=Climber, seconds=1e-2)
+    found = cheapest(SCENE, x, 1e9, beta=2.0, task=OWN, seconds=1e-2)
     assert found.best in {row.measured.discretisation for row in found.rows}

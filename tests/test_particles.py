@@ -41,3 +41,4 @@ def test_a_subset_keeps_what_belongs_together(scene):
     subset = particles.subset(keep)
     assert np.all(subset.position[:, 0] > 0.3)
     assert len(subset.volume) == len(subset.designed) == len(subset.actuator) == keep.sum()
+    assert np.array_equal(subset.region, particles.region[keep])

@@ -10,6 +10,7 @@ from walker import walker
 
 from mpmopt.assess.threshold import best_actuated, distance, pieces, post_processed, solid_reference
 from mpmopt.assess.verify import COMPLEX_STEP, COMPLEX_TOLERANCE, complex_step_test
+from mpmopt.design.objective import Objective
 from mpmopt.design.problem import Problem
 from mpmopt.errors import DesignError, SimulationError
 from mpmopt.simulation.checkpoints import Checkpointing
@@ -58,7 +59,9 @@ def test_after_a_transient_only_what_follows_counts_and_the_gradient_is_exact(fi
     whole = Problem(scene, beta=2.0)
     part = Problem(dataclasses.replace(scene, transient=first * scene.time_step), beta=2.0)
     simulation = whole.simulation(x)
-    start, before, end = map(whole.objective(simulation).centroid, simulation.run([0, first, 30]))
+    start, before, end = map(
+        Objective.of(scene, simulation.particles).centroid, simulation.run([0, first, 30])
+    )
     value, gradient = part.value_and_gradient(x)
     assert value == part.value(x) == pytest.approx(end - before + start, abs=1e-15)
     assert abs(value - whole.value(x)) > 1e-5

@@ -9,6 +9,8 @@ import pytest
 from conftest import small_scene
 
 from mpmopt.design.problem import Problem
+from mpmopt.design.task import AtMost, Task
+from mpmopt.design.terms import Effort, OnePiece, Speed, Volume
 from mpmopt.optimisation.history import Candidate, Iteration, Optimisation, StageState
 from mpmopt.optimisation.loop import begin
 from mpmopt.optimisation.mma import MovingAsymptotes
@@ -29,6 +31,7 @@ def distinct(kind, **given):
                 "int": lambda n=n: n,
                 "int | None": lambda n=n: n,
                 "float": lambda n=n: 1.0 / n,
+                "tuple[float, ...]": lambda n=n: (1.0 / n, -float(n)),
                 "str": lambda n=n: f"text {n}",
                 "bool": lambda field=field: field.default is not True,
                 "NDArray[np.float64]": lambda n=n: 1.0 / (n + np.arange(3.0)),
@@ -71,12 +74,13 @@ def run():
     settings = distinct(Settings, stages=tuple(stages), least_iterations=3, most_iterations=5)
     state = distinct(
         StageState, mma=asymptotes(), incumbent=distinct(Candidate),
-        incumbent_gradient=np.array([1.0, 2.0, 3.0]),
+        gradients=np.ones((3, 3)), incumbent_gradients=np.arange(9.0).reshape(3, 3),
     )  # fmt: skip
     return distinct(
         Optimisation,
         scene=small_scene(),
         settings=settings,
+        task=Task(Speed(0.01) - 0.5 * Effort(), (AtMost(Volume(), 0.5), AtMost(OnePiece(), 1.0))),
         x=np.array([0.5, -0.25]),
         stage=1,
         gave_up=True,
@@ -143,7 +147,7 @@ def test_every_field_of_a_scene_comes_back_from_its_text():
         field.name for field in dataclasses.fields(Scene)
         if same(getattr(scene, field.name), field.default)
     }  # fmt: skip
-    assert defaults == {"mirror"}
+    assert defaults == {"mirror", "ground", "clamps"}
     assert same(Scene.from_json(scene.to_json()), scene)
     half = small_scene(
         body=small_scene().body[2:3], walls=(), gravity=(0.0, -1.0), direction=(0.0, 1.0),

@@ -190,7 +190,9 @@ def virtual(file):
         (
             lambda f: (
                 f.create_group("stage").attrs.update(time_step=1.0, failures=0),
-                f["stage"].update({"values": [], "gradient": [1.0], "incumbent_gradient": []}),
+                f["stage"].update(
+                    {"values": [], "gradients": [[1.0]], "incumbent_gradients": [[]]}
+                ),
                 f["stage"].create_group("mma"),
             ),
             "do not fit together",

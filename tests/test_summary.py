@@ -12,7 +12,9 @@ from mpmopt.app.case import Case
 from mpmopt.app.summary import summarise
 from mpmopt.assess import refinement, threshold
 from mpmopt.assess.refinement import Variant
+from mpmopt.design.objective import Objective
 from mpmopt.design.problem import Problem
+from mpmopt.design.task import DEFAULT_TASK
 from mpmopt.errors import SimulationError
 from mpmopt.optimisation import presets
 from mpmopt.optimisation.history import Candidate, Optimisation
@@ -39,8 +41,8 @@ def finished(best_phi=1.0):
     first, best = candidate(0.0, 1.0, objective=0.1), candidate(best_phi, 0.75)
     history = [first, dataclasses.replace(first, failure="torn"), dataclasses.replace(best)]
     return Optimisation(
-        SCENE, SHORT, first.x, best={0: best}, history=history, first=first, last=best,
-        stop_reason="It ended.",
+        SCENE, SHORT, DEFAULT_TASK, first.x, best={0: best}, history=history, first=first,
+        last=best, stop_reason="It ended.",
     )  # fmt: skip
 
 
@@ -51,7 +53,7 @@ def told(monkeypatch):
     rows: list[Variant] = []
     block = [0.3]
 
-    def best_actuated(scene, baseline, *actuations):
+    def best_actuated(scene, baseline, *actuations, task):
         keep = baseline(np.zeros((32, 2)))
         asked.append((int(np.sum(keep)), [float(v.a[0]) for v in actuations]))
         if not np.all(keep):
@@ -134,7 +136,7 @@ def test_a_case_starts_where_it_says(tmp_path, monkeypatch):
 def test_a_baseline_is_kept_for_each_coarsening_of_the_stages(tmp_path, monkeypatch):
     monkeypatch.setattr(case, "_go_on", lambda path, kept, checkpointing: kept.baseline)
     stages = (dataclasses.replace(STAGE, coarsening=2, time_step=4e-3, solid=False), STAGE)
-    twice = [
+    twice: list[dict[str, Any]] = [
         {name: tuple(2 * k for k in getattr(part, name)) for name in ("lower", "upper")}
         for part in SCENE.body
     ]
@@ -248,7 +250,8 @@ def test_a_distance_after_a_transient_counts_from_there():
     # The body falls to one side at once.
     scene = small_scene(steps=6, transient=3 * 4e-3, gravity=(5.0, 0.0), walls=())
     keep, variables = np.ones(32, dtype=bool), PROBLEM.split(PROBLEM.join(1.0, 0.5, 0.0, 0.0))
-    simulation, objective = threshold.solid_body(scene, keep, variables)
+    simulation = threshold.solid_body(scene, keep, variables)
+    objective = Objective.of(scene, simulation.particles)
     states = simulation.run([3, 6])
     settled, end = (objective.centroid(state) for state in states)
     expected = objective.start + end - settled

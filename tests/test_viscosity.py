@@ -1,9 +1,12 @@
 """Kelvin-Voigt viscosity: its stress and adjoint, the power it takes, and the laws it obeys."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from conftest import small_scene, worst
-from exact import at_rest, solid_simulation
+from exact import Bar, at_rest, solid_simulation
+from stability import time_step
 
 from mpmopt import kernels
 from mpmopt.assess.verify import COMPLEX_STEP, DOT_TOLERANCE, complex_step_test, kernel_mismatches
@@ -82,14 +85,10 @@ def test_kernels_do_what_the_equations_say(rng, dtype):
 
 def test_every_kernel_is_transposed_and_the_whole_gradient_is_exact(rng):
     scene = viscous_scene()
-    assert worst_of(kernel_mismatches(scene)) <= DOT_TOLERANCE
+    assert max(kernel_mismatches(scene).values()) <= DOT_TOLERANCE
     problem = Problem(scene, 2.0, halvings=0, limits=None)
     x = problem.join(rng.uniform(-1.0, 1.0, 32), [0.9, 0.5], [-0.3, 0.2], [-0.5, 0.1])
     assert worst(complex_step_test(problem, x)) <= 1e-12
-
-
-def worst_of(mismatches):
-    return max(mismatches.values())
 
 
 def test_a_solid_in_uniform_strain_loses_what_viscosity_takes():
@@ -116,3 +115,54 @@ def test_a_solid_in_uniform_strain_loses_what_viscosity_takes():
     D = (rate + rate.T) / 2.0
     taken = particles.volume.sum() * 1e-5 * ETA * np.sum(D**2)
     assert lost[1] - lost[0] == pytest.approx(taken, rel=1e-3)
+
+
+def test_a_bar_vibrates_with_the_damping_that_eta_says():
+    # Its own damping, that of the transfers, is that of the bar without viscosity.
+    plain, viscous = Bar(16, 0.25), Bar(16, 0.25, viscosity=20.0)
+    own, found = (b.value_and_gradient()[0] for b in (plain, viscous))
+    assert viscous.damped() < 0.7
+    assert found / own == pytest.approx(viscous.damped(), rel=0.01)
+
+
+def test_the_courant_number_follows_stretch(rng):
+    # The step over the longest stable one, of moduli from the maps of strain rates to stress.
+    scene = viscous_scene()
+    particles = discretise(scene)
+    state = at_rest(particles)
+    state[8:12, 0] += rng.uniform(-0.4, 0.6, 4)
+    simulation = solid_simulation(scene, particles, state)
+    F, mu, la = state[8:12, 0].reshape(2, 2), scene.material.lame_mu, scene.material.lame_lambda
+    b = F @ F.T
+    basis = [np.diag([1.0, 0.0]), np.diag([0.0, 1.0]), np.array([[0.0, 1.0], [1.0, 0.0]]) / 2**0.5]
+
+    def modulus(change):
+        return np.linalg.eigvalsh([[np.sum(E * change(D)) for D in basis] for E in basis]).max()
+
+    elastic = modulus(lambda D: mu * (D @ b + b @ D) + la * np.trace(D) * np.eye(2))
+    viscous = modulus(lambda D: ETA * b @ D @ b)
+    dt, per = scene.time_step, 4.0 / scene.grid.dx**2  # rho = 1
+    longest = 4.0 / (per * viscous + np.sqrt((per * viscous) ** 2 + 4.0 * per * elastic))
+    found = simulation.indicators(kernels.grouped(state)).courant
+    assert found == pytest.approx(dt / longest, rel=1e-12)
+    assert found > scene.time_step / scene.largest_time_step
+
+
+def test_the_limit_on_the_step_is_that_of_the_isolated_particle_and_blocks_bear_more():
+    for eta in (0.3, 10.0):
+        material = Material(1.0, 1.0, viscosity=eta)
+        legal = material.largest_time_step(1.0)
+        # c dt + omega^2 dt^2 / 2 = 2 with c = 4 eta / (rho dx^2), omega^2 = 8 (lambda + mu) / ...
+        assert 4.0 * eta * legal + 8.0 * legal**2 == pytest.approx(2.0, rel=1e-12)
+        scene = dataclasses.replace(
+            time_step.block_scene(steps=1000), material=material, time_step=0.9 * legal
+        )  # fmt: skip
+        courant = legal * material.wave_speed
+
+        def stable(particles, share, scene=scene, courant=courant):
+            ones = np.ones(len(particles.position))
+            return time_step.stays_small(scene, particles, ones, share * courant)
+
+        one, block = time_step.isolated(scene), discretise(scene)
+        assert stable(one, 0.98) and not stable(one, 1.02)
+        assert stable(block, 1.2) and not stable(block, 1.6)

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from mpmopt.design.objective import Objective
 from mpmopt.design.problem import Problem
 from mpmopt.errors import SimulationError
 from mpmopt.scene import Actuator, Material, Scene
@@ -49,7 +50,7 @@ def at_random(case: str, beta: float, seed: int, cells: int = 64) -> dict[str, A
             states = simulation.run([*range(0, scene.steps, 20), scene.steps])
         except SimulationError as error:
             return row | {"error": str(error)}
-        row[key] = float(problem.objective(simulation).centroid(states[-1]))
+        row[key] = float(Objective.of(problem.scene, simulation.particles).centroid(states[-1]))
         if key == "distance":
             solid = np.ones(states.shape[2], dtype=bool)
             solid[problem.particles.designed] = problem.gamma(x) >= 0.5

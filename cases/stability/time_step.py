@@ -109,9 +109,7 @@ def isolated(scene: Scene) -> Particles:
 
 def shifted(particles: Particles, by: float) -> Particles:
     """The same particles elsewhere between the nodes."""
-    return Particles(
-        particles.position + by, particles.volume, particles.designed, particles.actuator
-    )
+    return replace(particles, position=particles.position + by)
 
 
 def resting_limit(body: str, steps: int, shift: float = 0.0) -> dict[str, Any]:

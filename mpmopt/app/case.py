@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from mpmopt.app.summary import summarise
 from mpmopt.assess.threshold import Baseline
 from mpmopt.design.problem import Problem
+from mpmopt.design.task import DEFAULT_TASK, Task
 from mpmopt.errors import DesignError, RunFileError, StorageError
 from mpmopt.io.console import say
 from mpmopt.io.files import locked, make_folder, refuse_existing, replace_file
@@ -49,6 +50,8 @@ class Case:
     start : mapping, optional
         First phi, a, theta and b, as `Problem.join` takes them: one number for all actuators, or
         one for each. What is left out is that of `START`.
+    task : Task, optional
+        Objective and constraints; default: the displacement.
 
     Raises
     ------
@@ -60,11 +63,13 @@ class Case:
     settings: Settings
     baseline: Baseline
     start: Mapping[str, Any] = field(default_factory=dict)
+    task: Task = DEFAULT_TASK
 
     def __post_init__(self) -> None:
         instance("Case", "scene", self.scene, Scene)
         instance("Case", "settings", self.settings, Settings, HOW)
         instance("Case", "start", self.start, Mapping)
+        instance("Case", "task", self.task, Task)
         if not callable(self.baseline):
             raise DesignError(
                 f"Case: baseline = {shown(self.baseline)} must be a function of positions (D, 2), "
@@ -144,7 +149,7 @@ def run(
         raise DesignError(f"run: phi = {shown(phi)} must be a function of positions (D, 2)")
     plain = case.start if phi is None else {**case.start, "phi": phi(position)}
     start = problem.join(**plain)
-    new, baseline = begin(case.scene, case.settings, start), baseline_particles(case)
+    new, baseline = begin(case.scene, case.settings, start, case.task), baseline_particles(case)
     make_folder(folder)
     with locked(path):
         if path.exists() and not force:
@@ -155,7 +160,8 @@ def run(
                     f"{error}; choose another folder, or --force to replace it"
                 ) from error
             begun = kept.run.first.x if kept.run.first else kept.run.x
-            same = (kept.run.scene, kept.run.settings) == (case.scene, case.settings)
+            its = kept.run.scene, kept.run.settings, kept.run.task
+            same = its == (case.scene, case.settings, case.task)
             if not same or not np.array_equal(begun, start):
                 raise StorageError(
                     f"{path} holds an earlier run of another case; choose another folder, or "

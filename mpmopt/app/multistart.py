@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from mpmopt.app.case import RESULTS, Case, baseline_particles, draw_or_warn, run
 from mpmopt.app.sweeps import as_csv, connected, sweep
 from mpmopt.assess.threshold import Baseline
+from mpmopt.design.task import Task
 from mpmopt.errors import RunFileError, SweepError
 from mpmopt.io.files import locked, make_folder, refuse_existing, replace_file
 from mpmopt.optimisation.loop import check_body_fits
@@ -68,6 +69,7 @@ def one_start(
     scene: str,
     settings: dict[str, Any],
     start: dict[str, Any],
+    task: str,
     seed: int,
     *,
     baseline: Baseline,
@@ -84,7 +86,9 @@ def one_start(
         design, and `refined_gain` the least of it as designed, with half the step, and with cells
         half as wide.
     """
-    case = Case(Scene.from_json(scene), Settings.from_dict(settings), baseline, start)
+    case = Case(
+        Scene.from_json(scene), Settings.from_dict(settings), baseline, start, Task.from_json(task)
+    )
     folder = out / f"start-{seed}"
     folder.mkdir(parents=True, exist_ok=True)
     # Paths may hold what is no text.
@@ -164,6 +168,7 @@ def multistart(
         "scene": case.scene.to_json(),
         "settings": dataclasses.asdict(case.settings),
         "start": {name: np.asarray(value).tolist() for name, value in case.start.items()},
+        "task": case.task.to_json(),
     }
     function = functools.partial(one_start, baseline=case.baseline, out=out)
     with connected(scheduler) as executor:

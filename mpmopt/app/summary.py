@@ -41,7 +41,9 @@ def summarise(result: Optimisation, baseline: Mapping[int, NDArray[np.bool_]]) -
     there = baseline.get(result.settings.stages[best.stage].coarsening)
     actuations = [Variables.of(item.x, item.gamma.size) for item in (first, best)]
     actuation = actuations[1]
-    reference = _value_or_none(lambda: best_actuated(problem.scene, solid_reference, *actuations))
+    reference = _value_or_none(
+        lambda: best_actuated(problem.scene, solid_reference, *actuations, task=result.task)
+    )
     block = np.nan if reference is None else reference
 
     def numbers(values: np.ndarray) -> float | list[float]:
@@ -52,7 +54,9 @@ def summarise(result: Optimisation, baseline: Mapping[int, NDArray[np.bool_]]) -
         "reference": reference,
         "baseline": None
         if there is None
-        else _value_or_none(lambda: best_actuated(problem.scene, lambda _: there, *actuations)),
+        else _value_or_none(
+            lambda: best_actuated(problem.scene, lambda _: there, *actuations, task=result.task)
+        ),
         "optimised": best.objective,
         "post_processed": _value_or_none(lambda: post_processed(problem, best.x)),
         "actuation_off": _value_or_none(lambda: unactuated(problem, best.x)),
@@ -70,6 +74,7 @@ def summarise(result: Optimisation, baseline: Mapping[int, NDArray[np.bool_]]) -
             for row in rows
         },
         "retained_gain": {row.name: _number_or_none(row.retained) for row in others},
+        **_constraints(result),
         "non_discreteness": best.non_discreteness,
         "a": numbers(actuation.a),
         "theta": numbers(actuation.theta),
@@ -80,6 +85,14 @@ def summarise(result: Optimisation, baseline: Mapping[int, NDArray[np.bool_]]) -
         "seconds": result.history[-1].seconds,
         "stop_reason": result.stop_reason,
     }
+
+
+def _constraints(result: Optimisation) -> dict[str, Any]:
+    """Value and multiplier of each constraint at the best design, if there are any."""
+    best, constraints = result.result, result.task.subject_to
+    rows = zip(map(str, constraints), zip(best.constraints, best.multipliers))
+    found = {f"{name}: value, multiplier": list(pair) for name, pair in rows}
+    return {"constraints": found} if found else {}
 
 
 def _value_or_none(function: Callable[[], float]) -> float | None:

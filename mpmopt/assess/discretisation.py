@@ -19,6 +19,8 @@ from numpy.typing import NDArray
 from mpmopt.assess.threshold import NO_GAIN
 from mpmopt.design.problem import Problem, Variables
 from mpmopt.design.step_control import LIMITS
+from mpmopt.design.task import DEFAULT_TASK, Task
+from mpmopt.design.term import Outcome
 from mpmopt.errors import DesignError, SceneError, SimulationError
 from mpmopt.scene import Actuator, Grid, Mirror, Scene
 from mpmopt.scene.particles import mirror_images
@@ -79,7 +81,7 @@ class Discretisation:
         if nx != round(nx) or ny != round(ny):
             raise SceneError(f"{multiple:g} times {scene.grid.cells} cells is no whole number")
         courant = scene.courant if courant is None else courant
-        steps = scene.duration * scene.material.wave_speed * multiple / scene.grid.dx / courant
+        steps = scene.duration * scene.wave_speed * multiple / scene.grid.dx / courant
         cells = round(nx), round(ny)
         own = cls(cells, math.ceil(steps - 1e-6), scene.particles_per_cell, mirror=scene.mirror)
         return replace(own, **changes)
@@ -101,11 +103,9 @@ class Discretisation:
             mirror=self.mirror,
         )
 
-    def problem(
-        self, scene: Scene, beta: float, kind: type[Problem] = Problem, **options: Any
-    ) -> Problem:
-        """The problem of the scene in this discretisation, with further options of its class."""
-        return kind(self.scene(scene), beta, precision=self.precision, **options)
+    def problem(self, scene: Scene, beta: float, **options: Any) -> Problem:
+        """The problem of the scene in this discretisation, with further options."""
+        return Problem(self.scene(scene), beta, precision=self.precision, **options)
 
 
 @dataclass(frozen=True)
@@ -215,7 +215,7 @@ def measure(
     checkpointing: Checkpointing | None = None,
     limits: Indicators | None = None,
     repeats: int = 1,
-    kind: type[Problem] = Problem,
+    task: Task = DEFAULT_TASK,
 ) -> Measured:
     """Objective and gradient of a design in one discretisation, and their cost.
 
@@ -231,8 +231,8 @@ def measure(
         Width of the squares over which the gradient is summed (`density`).
     repeats : int, optional
         Evaluations of which the fastest counts.
-    kind : type, optional
-        Class of the problem, should it have an objective of its own.
+    task : Task, optional
+        Whose objective is measured.
 
     Returns
     -------
@@ -245,7 +245,7 @@ def measure(
         problem = discretisation.problem(
             scene,
             beta,
-            kind,
+            task=task,
             void_cutoff=void_cutoff,
             checkpointing=checkpointing,
             halvings=0,
@@ -253,7 +253,8 @@ def measure(
         )
         x = design(problem)
         simulation = problem.simulation(x)
-        start = problem.objective(simulation).start
+        rest = dict.fromkeys((*problem.task.instants(problem.scene), 0), simulation.initial)
+        start = problem.task.maximise.value(Outcome(simulation, problem.gamma(x), rest))
         with simulation.checkpoints(problem.checkpointing) as store:
             schedule = store.schedule
         _compile(discretisation.precision)
@@ -402,7 +403,7 @@ def cheapest(
     gradient_tolerance: float | None = None,
     seconds: float = 60.0,
     progress: Callable[[Evidence], None] | None = None,
-    kind: type[Problem] = Problem,
+    task: Task = DEFAULT_TASK,
 ) -> Cheapest:
     """The cheapest discretisation whose objective and gradient are within a tolerance.
 
@@ -429,8 +430,8 @@ def cheapest(
         Processor time that the reference may take.
     progress : callable, optional
         Called with each line of evidence.
-    kind : type, optional
-        Class of the problem, should it have an objective of its own.
+    task : Task, optional
+        Whose objective is measured.
 
     Returns
     -------
@@ -448,9 +449,9 @@ def cheapest(
     )
     seconds = _limit("seconds", seconds)
     if not callable(design):
-        design = carried(kind(scene, beta, void_cutoff=void_cutoff), design)
+        design = carried(Problem(scene, beta, void_cutoff=void_cutoff), design)
     # Half a body is the same solution, but another objective may not be symmetric.
-    plane = symmetry(scene, design, beta) if kind is Problem else scene.mirror
+    plane = symmetry(scene, design, beta) if task == DEFAULT_TASK else scene.mirror
     scene = replace(scene, filter_length=filter_reach(scene))
     grid = _candidates(scene, plane)
     patch = max(scene.grid.size[0] / item.cells[0] for item in grid.values())
@@ -459,7 +460,7 @@ def cheapest(
     def result(item: Discretisation) -> Measured:
         if item not in found:
             found[item] = measure(
-                scene, item, design, beta, patch, void_cutoff=void_cutoff, limits=LIMITS, kind=kind
+                scene, item, design, beta, patch, void_cutoff=void_cutoff, limits=LIMITS, task=task
             )
         return found[item]
 

@@ -73,7 +73,7 @@ def least(problem: Problem, x: NDArray[np.float64]) -> float:
     """
     scene = problem.scene
     return min(
-        distance(there, mapped(there, problem, x), problem.split(x), problem.objective)
+        distance(there, mapped(there, problem, x), problem.split(x), problem.task)
         for there in (scene.vary(time_step=scene.time_step / 2.0), finer(scene))
     )
 
@@ -134,9 +134,9 @@ def study(
         try:
             there = make()
             keep = mapped(there, problem, x)
-            reference = distance(there, np.ones_like(keep), variables, problem.objective)
+            reference = distance(there, np.ones_like(keep), variables, problem.task)
             row = Variant(name, there.grid.cells, there.time_step, reference)
-            design = distance(there, keep, variables, problem.objective)
+            design = distance(there, keep, variables, problem.task)
             row = replace(row, distance=design)
             gain = rows[0].distance - rows[0].reference if rows else row.distance - reference
             retained = threshold.retained_share(scene, design - reference, gain)

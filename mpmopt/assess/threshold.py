@@ -9,12 +9,13 @@ from numpy.typing import NDArray
 from scipy.ndimage import label
 
 from mpmopt.design.actuation import signal
-from mpmopt.design.objective import Objective
 from mpmopt.design.problem import Problem, Variables
 from mpmopt.design.step_control import LIMITS, check_indicators
+from mpmopt.design.task import DEFAULT_TASK, Task
+from mpmopt.design.term import Outcome
 from mpmopt.errors import DesignError, SimulationError
 from mpmopt.scene import Scene
-from mpmopt.scene.particles import discretise
+from mpmopt.scene.particles import discretise, of_solid
 from mpmopt.simulation.formulations import simulation_of
 from mpmopt.simulation.simulation import Simulation
 from mpmopt.validation import shown
@@ -32,9 +33,7 @@ SOLID_LIMITS = LIMITS._replace(
 Baseline = Callable[[NDArray[np.float64]], NDArray[np.bool_]]
 
 
-def solid_body(
-    scene: Scene, keep: NDArray[np.bool_], variables: Variables
-) -> tuple[Simulation, Objective]:
+def solid_body(scene: Scene, keep: NDArray[np.bool_], variables: Variables) -> Simulation:
     """The body of which only some design particles are there, all of them solid.
 
     Parameters
@@ -62,22 +61,20 @@ def solid_body(
     there[particles.designed] = keep
     particles = particles.subset(there)
     ones = np.ones(there.sum())
-    material = scene.material
-    simulation = simulation_of(
+    return simulation_of(
         scene,
         particles,
-        density=material.density * ones,
+        density=of_solid(scene, particles, "density"),
         stiffness=ones,
         signal=signal(scene, variables.a, variables.theta, variables.b),
     )
-    return simulation, Objective.of(scene, particles)
 
 
 def distance(
     scene: Scene,
     keep: NDArray[np.bool_],
     variables: Variables,
-    objective: Callable[[Simulation], Objective] | None = None,
+    task: Task = DEFAULT_TASK,
 ) -> float:
     """Objective L of a `solid_body`.
 
@@ -85,8 +82,8 @@ def distance(
     ----------
     scene, keep, variables
         As in `solid_body`.
-    objective : callable, optional
-        That of a problem (`Problem.objective`), if it is not the scene's.
+    task : Task, optional
+        Whose objective it is.
 
     Raises
     ------
@@ -95,12 +92,10 @@ def distance(
     SimulationError
         If the simulation fails, or goes beyond `SOLID_LIMITS`.
     """
-    simulation, travel = solid_body(scene, keep, variables)
-    if objective is not None:
-        travel = objective(simulation)
-    end = simulation.watch(travel.instants)
+    simulation = solid_body(scene, keep, variables)
+    end = simulation.watch(task.maximise.instants(scene))
     check_indicators(end.indicators, simulation, SOLID_LIMITS)
-    return float(travel.value(end.states))
+    return float(task.maximise.value(Outcome(simulation, np.array(keep, float), end.states)))
 
 
 def kept(problem: Problem, x: NDArray, threshold: float = THRESHOLD) -> NDArray[np.bool_]:
@@ -129,7 +124,7 @@ def post_processed(problem: Problem, x: NDArray, threshold: float = THRESHOLD) -
         As `distance`.
     """
     keep, variables = kept(problem, x, threshold), problem.split(x)
-    return distance(problem.scene, keep, variables, problem.objective)
+    return distance(problem.scene, keep, variables, problem.task)
 
 
 def retained_share(scene: Scene, retained: float, gain: float) -> float:
@@ -147,7 +142,7 @@ def unactuated(problem: Problem, x: NDArray) -> float:
     """Objective L of the post-processed design when no actuator works: how far it merely falls."""
     variables = problem.split(x)
     still = variables._replace(a=0.0 * variables.a, b=0.0 * variables.b)
-    return distance(problem.scene, kept(problem, x), still, problem.objective)
+    return distance(problem.scene, kept(problem, x), still, problem.task)
 
 
 def pieces(scene: Scene, keep: NDArray[np.bool_]) -> NDArray[np.int64]:
@@ -188,7 +183,7 @@ def best_actuated(
     scene: Scene,
     baseline: Baseline,
     *actuations: Variables,
-    objective: Callable[[Simulation], Objective] | None = None,
+    task: Task = DEFAULT_TASK,
 ) -> float:
     """Objective L of the baseline design with the best of some actuations, of those that run.
 
@@ -198,7 +193,7 @@ def best_actuated(
     baseline : callable
         From the design particles' reference positions (D, 2) to which of them are there (D,).
     actuations : Variables
-    objective : callable, optional
+    task : Task, optional
         As in `distance`.
 
     Raises
@@ -211,7 +206,7 @@ def best_actuated(
     values, failure = [], None
     for actuation in actuations:
         try:
-            values.append(distance(scene, keep, actuation, objective))
+            values.append(distance(scene, keep, actuation, task))
         except SimulationError as error:
             failure = error
     if failure is not None and not values:

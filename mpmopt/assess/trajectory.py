@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpmopt.assess.threshold import kept, solid_body, solid_reference
-from mpmopt.design.objective import Objective
 from mpmopt.design.problem import Problem
+from mpmopt.design.term import Outcome, Term
 from mpmopt.kernels import parts
 from mpmopt.scene import Mirror, Scene
 from mpmopt.scene.particles import own
@@ -44,25 +44,28 @@ class Body:
         Of N particles.
     gamma : (N,) array
         Their material density.
-    objective : Objective
+    objective : Term
+    design : (D,) array
+        Material density of all design particles.
     """
 
     name: str
     simulation: Simulation
     gamma: NDArray[np.float64]
-    objective: Objective
+    objective: Term
+    design: NDArray[np.float64]
 
     def __post_init__(self) -> None:
-        own(self, "gamma")
+        own(self, "gamma", "design")
 
 
 def optimised(problem: Problem, x: NDArray[np.float64]) -> Body:
     """A design as it was optimised, with its void."""
-    gamma = np.ones(len(problem.particles.position))
-    gamma[problem.particles.designed] = problem.gamma(x)
+    gamma, design = np.ones(len(problem.particles.position)), problem.gamma(x)
+    gamma[problem.particles.designed] = design
     present = problem.present(problem.split(x).phi)
-    simulation = problem.simulation(x)
-    return Body("optimised design", simulation, gamma[present], problem.objective(simulation))
+    simulation, objective = problem.simulation(x), problem.task.maximise
+    return Body("optimised design", simulation, gamma[present], objective, design)
 
 
 def post_processed(problem: Problem, x: NDArray[np.float64]) -> Body:
@@ -79,9 +82,9 @@ def reference(problem: Problem, x: NDArray[np.float64]) -> Body:
 
 def solid(name: str, problem: Problem, x: NDArray[np.float64], keep: NDArray[np.bool_]) -> Body:
     """The body of which only the design particles in `keep` (D,) are there, all of them solid."""
-    simulation, _ = solid_body(problem.scene, keep, problem.split(x))
+    simulation = solid_body(problem.scene, keep, problem.split(x))
     gamma = np.ones(len(simulation.particles.position))
-    return Body(name, simulation, gamma, problem.objective(simulation))
+    return Body(name, simulation, gamma, problem.task.maximise, np.array(keep, float))
 
 
 @dataclass(frozen=True)
@@ -130,14 +133,20 @@ class Motion:
         """
         simulation, gamma = body.simulation, body.gamma
         scene, frames = simulation.scene, np.array(frames)
-        instants = body.objective.instants
+        instants = body.objective.instants(scene)
         ends = [max(int(frame), *instants, 0) for frame in frames]
         wanted = sorted({*map(int, frames), *instants, *ends})
         found = dict(zip(wanted, simulation.run(wanted)))
         states = np.array([found[int(frame)] for frame in frames])
         actuator = simulation.particles.actuator
         values = [
-            float(body.objective.value({step: found[step] for step in (*instants, end)}))
+            float(
+                body.objective.value(
+                    Outcome(
+                        simulation, body.design, {step: found[step] for step in (*instants, end)}
+                    )
+                )
+            )
             for end in ends
         ]
         if scene.mirror is not None:

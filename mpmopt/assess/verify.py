@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import math
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
@@ -23,10 +24,11 @@ from mpmopt.design.actuation import signal, signal_adjoint
 from mpmopt.design.chain import DesignChain
 from mpmopt.design.objective import Objective
 from mpmopt.design.problem import Problem
+from mpmopt.design.term import Outcome
 from mpmopt.errors import DesignError
 from mpmopt.kernels import Parts, parts
 from mpmopt.scene import Scene, Wall
-from mpmopt.scene.particles import discretise
+from mpmopt.scene.particles import discretise, of_solid
 from mpmopt.simulation.simulation import Simulation
 from mpmopt.simulation.surroundings import parameters_of
 from mpmopt.validation import count
@@ -196,7 +198,7 @@ class _Bench:
         sample = Simulation(
             scene,
             self.particles,
-            scene.material.density * vary,
+            of_solid(scene, self.particles, "density") * vary,
             vary[::-1],
             np.full((scene.steps, len(scene.actuators)), 0.7),
             self.state,
@@ -399,14 +401,27 @@ class _Bench:
         dtype = np.result_type(*v.values()).type
         scratch, grid = self._scratch(dtype), self._grid(v, dtype)
         for column in range(self.window[2]):
-            kernels.grid_update(grid, self.window, self.parameters, scratch.velocity, column)
+            kernels.grid_update(
+                grid,
+                self.window,
+                self.parameters,
+                self.parameters.clamps[0],
+                scratch.velocity,
+                column,
+            )
         return {"velocity": scratch.velocity}
 
     def grid_update_adjoint(self, v: Arrays, w: Arrays) -> Arrays:
         scratch, grid = self._scratch(float), self._grid(v, float)
         for column in range(self.window[2]):
             kernels.grid_update_adjoint(
-                grid, self.window, self.parameters, w["velocity"], scratch.node_bar, column
+                grid,
+                self.window,
+                self.parameters,
+                self.parameters.clamps[0],
+                w["velocity"],
+                scratch.node_bar,
+                column,
             )
         node_bar = scratch.node_bar[:, self.mass_grid > 0.0]
         result = {"grid": node_bar[..., :3], "normal_force": node_bar[0, :, 3]}
@@ -499,7 +514,7 @@ def complex_step_test(
 
 
 def _settled(problem: Problem, x: NDArray[np.float64]) -> tuple[Problem, NDArray[np.float64]]:
-    """The problem in the time step that x is evaluated with, which stays, and the gradient."""
+    """The problem in the time step that x is evaluated with, which stays, and the gradients."""
     if problem.precision != "double":
         raise DesignError(
             f'precision = "{problem.precision}" has no gradient that agrees to rounding; verify '
@@ -508,12 +523,12 @@ def _settled(problem: Problem, x: NDArray[np.float64]) -> tuple[Problem, NDArray
     evaluation = problem.evaluate(x)
     problem = problem.at(evaluation.time_step)
     problem.halvings, problem.limits = 0, None
-    return problem, evaluation.gradient
+    return problem, evaluation.gradients
 
 
 def _complex_steps(
     problem: Problem,
-    gradient: NDArray[np.float64],
+    gradients: NDArray[np.float64],
     x: NDArray[np.float64],
     directions: int,
     seed: int,
@@ -522,9 +537,9 @@ def _complex_steps(
     rng, ulp = np.random.default_rng(seed), np.finfo(float).eps
     move = 2.0 * ulp * rng.choice([-1.0, 1.0], x.size)
     # To both sides, for a body at rest on a wall is where the objective has a kink.
-    moved = [problem.evaluate(np.clip(x + s * move, -1.0, 1.0)).gradient for s in (-1.0, 1.0)]
-    change = sum(float(np.linalg.norm(other - gradient)) for other in moved)
-    rounding = ulp * max(problem.scene.grid.size)
+    sides = (problem.evaluate(np.clip(x + s * move, -1.0, 1.0)) for s in (-1.0, 1.0))
+    change = sum(np.linalg.norm(other.gradients - gradients, axis=1) for other in sides)
+    rounding = ulp * np.array([max(problem.scene.grid.size), *len(problem.task.subject_to) * [1.0]])
     variables = problem.split(np.arange(x.size) / x.size)
     vectors = {}
     for number in range(directions if variables.phi.size else 0):
@@ -537,22 +552,30 @@ def _complex_steps(
             d[index] = 1.0
             vectors[f"{name} of actuator {k}"] = d
     for name, d in vectors.items():
-        exact, terms = _derivative(problem, x + 1j * COMPLEX_STEP * d)
+        exact, terms = _derivatives(problem, x + 1j * COMPLEX_STEP * d)
         length = np.linalg.norm(d)
-        scale = max(abs(exact), terms, rounding * length)
-        noise = (change + rounding) * length / scale
-        yield name, ComplexStep(float(abs(exact - gradient @ d) / scale), float(noise))
+        scale = np.maximum(np.maximum(abs(exact), terms), rounding * length)
+        error, noise = abs(exact - gradients @ d) / scale, (change + rounding) * length / scale
+        for k in range(len(gradients)):
+            of = f"{name}, {problem.task.subject_to[k - 1].term}" if k else name
+            yield of, ComplexStep(float(error[k]), float(noise[k]))
 
 
-def _derivative(problem: Problem, x: NDArray[np.complex128]) -> tuple[float, float]:
-    """The derivative of L by the complex step, and the size of its terms, one per number."""
+def _derivatives(problem: Problem, x: NDArray[np.complex128]) -> tuple[NDArray, NDArray]:
+    """Those of all terms (1 + m,) by the complex step, and the size of what each is a sum of."""
     simulation = problem.simulation(x)
-    objective = problem.objective(simulation)
-    states = simulation.watch(objective.instants).states
-    bars = objective.terminal_adjoints({step: state.real for step, state in states.items()})
-    terms = [bar * states[step].imag / COMPLEX_STEP for step, bar in bars.items()]
-    exact = objective.value(states).imag / COMPLEX_STEP
-    return float(exact), float(np.linalg.norm(terms))
+    states = simulation.watch(problem.task.instants(problem.scene)).states
+    outcome = Outcome(simulation, problem.gamma(x), states)
+    real_states = {step: state.real for step, state in states.items()}
+    real = Outcome(problem.simulation(x.real), outcome.gamma.real, real_states)
+    exact, size = [], []
+    for term in problem.task.terms:
+        bars = term.adjoints(real)
+        parts = [bar * states[step].imag for step, bar in bars.states.items()]
+        parts += [bars.gamma * outcome.gamma.imag, bars.signal * simulation.signal.imag]
+        exact.append(np.imag(term.value(outcome)) / COMPLEX_STEP)
+        size.append(math.hypot(*(float(np.linalg.norm(part)) for part in parts)) / COMPLEX_STEP)
+    return np.array(exact), np.array(size)
 
 
 class Taylor(NamedTuple):

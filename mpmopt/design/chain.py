@@ -11,7 +11,14 @@ from numpy.typing import NDArray
 from mpmopt.errors import DesignError
 from mpmopt.kernels import interpolation
 from mpmopt.scene import Material, Scene
-from mpmopt.scene.particles import Particles, discretise, mirror_images, own
+from mpmopt.scene.particles import (
+    Particles,
+    Solids,
+    discretise,
+    mirror_images,
+    own,
+    solids,
+)
 from mpmopt.validation import number
 
 # Nodes with less than this of a particle's weight do not carry it. Lattice sites have none or far
@@ -118,7 +125,7 @@ class DesignChain:
     Parameters
     ----------
     scene : Scene
-        Its material and filter weights.
+        Its materials and filter weights.
     particles : Particles
     beta : float
         Sharpness of the projection, > 0.
@@ -133,7 +140,7 @@ class DesignChain:
         self.beta = number("DesignChain", "beta", beta, above=0.0, error=DesignError)
         self.filter = filter_matrix(scene, particles)
         self.designed = particles.designed
-        self.material = scene.material
+        self.solids = solids(scene, particles)
         self._last: Field | None = None
 
     def field(self, phi: NDArray) -> Field:
@@ -148,7 +155,7 @@ class DesignChain:
         filtered = filtered - (filtered.real - np.clip(filtered.real, -1.0, 1.0))  # rounding
         gamma = np.ones(self.designed.size, dtype=np.result_type(phi, float))
         gamma[self.designed] = project(filtered, self.beta)
-        material = interpolate(self.material, gamma)
+        material = interpolate(self.solids, gamma)
         self._last = Field(self, phi, filtered, gamma[self.designed], *material)
         return self._last
 
@@ -180,15 +187,18 @@ class Field:
     def __post_init__(self) -> None:
         own(self, "phi", "filtered", "gamma", "density", "stiffness")
 
-    def pullback(self, density_bar: NDArray, stiffness_bar: NDArray) -> NDArray:
-        """phi_bar (D,) from the adjoints of density and stiffness, (N,) each."""
+    def pullback(
+        self, density_bar: NDArray, stiffness_bar: NDArray, gamma_bar: NDArray | float = 0.0
+    ) -> NDArray:
+        """phi_bar (D,) from the adjoints of density and stiffness (N,), and of gamma (D,)."""
         chain = self.chain
-        gamma_bar = interpolate_adjoint(chain.material, density_bar, stiffness_bar)
-        phi_bar = project_adjoint(self.filtered, chain.beta, gamma_bar[chain.designed])
+        through = interpolate_adjoint(chain.solids, density_bar, stiffness_bar)
+        gamma_bar = through[chain.designed] + gamma_bar
+        phi_bar = project_adjoint(self.filtered, chain.beta, gamma_bar)
         return chain.filter.T @ phi_bar
 
 
-def interpolate(material: Material, gamma: NDArray) -> tuple[NDArray, NDArray]:
+def interpolate(material: Material | Solids, gamma: NDArray) -> tuple[NDArray, NDArray]:
     """Density and stiffness, linear in gamma between floors and solid (paper, sec. 2.2)."""
     mass = (1.0 - material.void_density) * gamma + material.void_density
     stiffness = (1.0 - material.void_stiffness) * gamma + material.void_stiffness
@@ -196,7 +206,7 @@ def interpolate(material: Material, gamma: NDArray) -> tuple[NDArray, NDArray]:
 
 
 def interpolate_adjoint(
-    material: Material, density_bar: NDArray, stiffness_bar: NDArray
+    material: Material | Solids, density_bar: NDArray, stiffness_bar: NDArray
 ) -> NDArray:
     """gamma_bar from the adjoints of density and stiffness."""
     return (1.0 - material.void_density) * material.density * density_bar + (

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from mpmopt.design.actuation import signal, signal_adjoint
 from mpmopt.design.chain import DesignChain
-from mpmopt.design.objective import Objective
 from mpmopt.design.step_control import LIMITS, check_indicators, too_long, with_halvings
+from mpmopt.design.task import DEFAULT_TASK, Task
+from mpmopt.design.term import Adjoints, Outcome
 from mpmopt.errors import DesignError
 from mpmopt.scene import Scene
 from mpmopt.scene.particles import discretise, nearest_designed
@@ -22,7 +23,7 @@ from mpmopt.simulation.buffers import Memory
 from mpmopt.simulation.checkpoints import Checkpointing
 from mpmopt.simulation.formulations import simulation_of
 from mpmopt.simulation.indicators import Indicators
-from mpmopt.simulation.simulation import Precision, Simulation, check_precision
+from mpmopt.simulation.simulation import Gradient, Precision, Simulation, check_precision
 from mpmopt.validation import count, instance, share
 
 ORDER_HINT = (
@@ -70,6 +71,10 @@ class Evaluation:
         Of that run.
     halved : int
         How often the step was halved to get there.
+    constraints : (m,) array
+        Values of the constraints' terms, in the task's order.
+    jacobian : (m, D + 3 K) array
+        Their gradients; empty if only values were asked for.
     """
 
     value: Any
@@ -77,10 +82,17 @@ class Evaluation:
     indicators: Indicators
     time_step: float
     halved: int = 0
+    constraints: NDArray = field(default_factory=lambda: np.empty(0))
+    jacobian: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 0)))
+
+    @property
+    def gradients(self) -> NDArray[np.float64]:
+        """Those of the objective and of the constraints' terms (1 + m, D + 3 K)."""
+        return np.vstack([self.gradient, *self.jacobian])
 
 
 class Problem:
-    """How far a design travels in a scene, and which way to change it.
+    """What a design achieves of a task in a scene, and which way to change it.
 
     The vector x of an optimiser is phi, a, theta, b in this order, all within [-1, 1].
 
@@ -101,6 +113,8 @@ class Problem:
         Beyond which an evaluation is not trusted; None: only what fails is rejected.
     precision : {"double", "single"}, optional
         Of the simulation (`Simulation`).
+    task : Task, optional
+        Objective and constraints; default: the displacement.
 
     Attributes
     ----------
@@ -112,8 +126,8 @@ class Problem:
     Raises
     ------
     DesignError
-        If the scene is none, or beta, `void_cutoff`, `halvings`, `limits` or `precision` makes
-        no sense.
+        If the scene is none, or beta, `void_cutoff`, `halvings`, `limits`, `precision` or the task
+        makes no sense.
     """
 
     def __init__(
@@ -125,8 +139,12 @@ class Problem:
         halvings: int = 2,
         limits: Indicators | None = LIMITS,
         precision: Precision = "double",
+        task: Task = DEFAULT_TASK,
     ) -> None:
         instance("Problem", "scene", scene, Scene)
+        instance("Problem", "task", task, Task)
+        task.instants(scene)  # what makes no sense is told now
+        self.task = task
         self.checkpointing = Checkpointing() if checkpointing is None else checkpointing
         instance("Problem", "checkpointing", self.checkpointing, Checkpointing)
         self.scene = scene
@@ -239,14 +257,6 @@ class Problem:
             precision=self.precision,
         )
 
-    def objective(self, simulation: Simulation) -> Objective:
-        """How far the body of a simulation goes: of this problem's, or of a solid one of its scene.
-
-        What pictures, post-processing and refinement studies measure too, should a subclass have
-        another.
-        """
-        return Objective.of(simulation.scene, simulation.particles)
-
     def at(self, time_step: float) -> Problem:
         """The same problem in another time step.
 
@@ -270,6 +280,10 @@ class Problem:
             If the simulation fails, or comes too close to it, in all time steps that are tried.
         """
         return self._accepted(lambda problem: problem._value(x)).value
+
+    def constraints(self, x: NDArray) -> NDArray:
+        """Values (m,) of the constraints' terms, as `value`."""
+        return self._accepted(lambda problem: problem._value(x)).constraints
 
     def value_and_gradient(self, x: NDArray) -> tuple[float, NDArray[np.float64]]:
         """Objective L and its gradient (D + 3 K,), by the reverse loop.
@@ -301,39 +315,69 @@ class Problem:
 
     def _value(self, x: NDArray) -> Evaluation:
         simulation = self.simulation(x)
-        objective = self.objective(simulation)
-        end = simulation.watch(objective.instants)
+        end = simulation.watch(self.task.instants(self.scene))
         self._check(end.indicators, simulation)
-        value = _finite(objective.value(end.states), simulation)
-        return Evaluation(value, np.empty(0), end.indicators, self.scene.time_step)
+        outcome = Outcome(simulation, self.gamma(x), end.states)
+        value, *others = (_finite(term.value(outcome), simulation) for term in self.task.terms)
+        return Evaluation(
+            value,
+            np.empty(0),
+            end.indicators,
+            self.scene.time_step,
+            constraints=np.array(others),
+        )
 
     def _value_and_gradient(self, x: NDArray[np.float64]) -> Evaluation:
-        phi, a, theta, _ = self.split(x)
-        simulation = self.simulation(x)
+        variables, simulation = self.split(x), self.simulation(x)
         try:
             memory = self._memories.pop()
         except IndexError:  # the first evaluation, or others are under way
             memory = Memory()
         try:
-            return self._differentiate(phi, a, theta, simulation, memory)
+            return self._differentiate(variables, simulation, memory)
         finally:
             self._memories.append(memory)
 
     def _differentiate(
-        self, phi: NDArray, a: NDArray, theta: NDArray, simulation: Simulation, memory: Memory
+        self, variables: Variables, simulation: Simulation, memory: Memory
     ) -> Evaluation:
+        gamma = self.chain.field(variables.phi).gamma
+        values, gradients = [], []
         with simulation.checkpoints(self.checkpointing) as checkpoints:
-            objective = self.objective(simulation)
-            forward = simulation.forward(checkpoints, memory, objective.instants)
+            instants = self.task.instants(self.scene)
+            forward = simulation.forward(checkpoints, memory, instants)
             self._check(forward.indicators, simulation)
-            value = float(_finite(objective.value(forward.states), simulation))
-            gradient = forward.reverse(objective.terminal_adjoints(forward.states))
-        bars = np.zeros((2, len(self.particles.position)))
-        bars[:, self.present(phi)] = gradient.density, gradient.stiffness
-        phi_bar = self.chain.field(phi).pullback(*bars)
-        parts = phi_bar, *signal_adjoint(self.scene, a, theta, gradient.signal)
-        whole = _finite(np.concatenate(parts), simulation)
-        return Evaluation(value, whole, forward.indicators, self.scene.time_step)
+            outcome, swept = Outcome(simulation, gamma, forward.states), False
+            for term in self.task.terms:
+                values.append(float(_finite(term.value(outcome), simulation)))
+                bars, sweep = term.adjoints(outcome), None
+                if bars.states:
+                    if swept:  # which overwrote what another needs
+                        forward = simulation.forward(checkpoints, memory, instants)
+                    sweep, swept = forward.reverse(bars.states), True
+                gradients.append(_finite(self._pullback(variables, bars, sweep), simulation))
+        return Evaluation(
+            values[0],
+            gradients[0],
+            forward.indicators,
+            self.scene.time_step,
+            constraints=np.array(values[1:]),
+            jacobian=np.array(gradients)[1:],
+        )
+
+    def _pullback(
+        self, variables: Variables, bars: Adjoints, sweep: Gradient | None
+    ) -> NDArray[np.float64]:
+        """The gradient (D + 3 K,) of a term, from its adjoints and the sweep that they began."""
+        phi, a, theta, _ = variables
+        density_bar, stiffness_bar = np.zeros((2, len(self.particles.position)))
+        signal_bar = np.zeros((self.scene.steps, a.size)) + bars.signal
+        if sweep is not None:
+            present = self.present(phi)
+            density_bar[present], stiffness_bar[present] = sweep.density, sweep.stiffness
+            signal_bar = sweep.signal + bars.signal
+        phi_bar = self.chain.field(phi).pullback(density_bar, stiffness_bar, bars.gamma)
+        return np.concatenate([phi_bar, *signal_adjoint(self.scene, a, theta, signal_bar)])
 
     def _check(self, indicators: Indicators, simulation: Simulation) -> None:
         if self.limits is not None:

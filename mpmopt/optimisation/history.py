@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpmopt.design.problem import Problem
+from mpmopt.design.task import Task
 from mpmopt.errors import DesignError
 from mpmopt.optimisation.settings import Settings
 from mpmopt.scene import Scene
@@ -50,6 +51,13 @@ class Iteration:
         How often the stage's time step was halved for this evaluation.
     courant, velocity_increment, jacobian, stretch, energy, gap : float
         Its `indicators.Indicators`, or not a number if it failed.
+    violation : float
+        By how much it misses the constraint that it misses most, in that one's scale; 0 if it meets
+        all (`task.FEASIBLE`), or not a number if it failed.
+    constraints : tuple of float
+        Values of the constraints' terms, in the task's order.
+    multipliers : tuple of float
+        By how much L rises with each bound, as the step that led here took it; zeros for the first.
     failure : str
         Why the evaluation failed, or empty.
     """
@@ -72,6 +80,9 @@ class Iteration:
     stretch: float = np.nan
     energy: float = np.nan
     gap: float = np.nan
+    violation: float = 0.0
+    constraints: tuple[float, ...] = ()
+    multipliers: tuple[float, ...] = ()
     failure: str = ""
 
     @property
@@ -115,12 +126,12 @@ class StageState:
         Failed evaluations in a row.
     values : (k,) array
         Objectives of those that succeeded.
-    gradient : (n,) array
-        Of the last evaluation, empty if it failed.
+    gradients : (1 + m, n) array
+        Of objective and constraints at the last evaluation, empty if it failed.
     incumbent : Candidate or None
-        The one with the largest objective.
-    incumbent_gradient : (n,) array
-        Its gradient, empty if there is none.
+        The one with the largest objective of those that meet the constraints best.
+    incumbent_gradients : (1 + m, n) array
+        Its gradients, empty if there is none.
     mma : mapping of str to array or number
         `MovingAsymptotes.state` before the step.
     """
@@ -128,13 +139,13 @@ class StageState:
     time_step: float
     failures: int
     values: NDArray[np.float64]
-    gradient: NDArray[np.float64]
+    gradients: NDArray[np.float64]
     incumbent: Candidate | None
-    incumbent_gradient: NDArray[np.float64]
+    incumbent_gradients: NDArray[np.float64]
     mma: Mapping[str, Any]
 
     def __post_init__(self) -> None:
-        own(self, "values", "gradient", "incumbent_gradient")
+        own(self, "values", "gradients", "incumbent_gradients")
 
 
 @dataclass(repr=False)
@@ -145,6 +156,7 @@ class Optimisation:
     ----------
     scene : Scene
     settings : Settings
+    task : Task
     x : (n,) array
         The design that its stage began with.
     stage : int
@@ -167,6 +179,7 @@ class Optimisation:
 
     scene: Scene
     settings: Settings
+    task: Task
     x: NDArray[np.float64]
     stage: int = 0
     reason: str = ""
@@ -184,7 +197,7 @@ class Optimisation:
 
         That is the one that counts most (`Candidate.counted`), where stages ask for bodies without
         void, and of refined stages where there are some; else the best of the last stage that had
-        one, whose projection is the sharpest.
+        one, whose projection is the sharpest. Those that meet the constraints come first.
 
         Raises
         ------
@@ -197,9 +210,9 @@ class Optimisation:
         stages = self.settings.stages
         grid = stages[max(self.best)].coarsening
 
-        def merit(item: Candidate) -> tuple[bool, float, int]:
+        def merit(item: Candidate) -> tuple[float, bool, float, int]:
             refined = stages[item.stage].refined and np.isfinite(item.counted)
-            return bool(refined), item.counted, item.stage
+            return -item.violation, bool(refined), item.counted, item.stage
 
         on_grid = (item for stage, item in self.best.items() if stages[stage].coarsening == grid)
         return max(on_grid, key=merit)
@@ -207,7 +220,7 @@ class Optimisation:
     def problem(self) -> Problem:
         """The problem that `result` solves, in the time step that it was evaluated with."""
         best = self.result
-        return self.settings.stages[best.stage].problem(self.scene, best.time_step)
+        return self.settings.stages[best.stage].problem(self.scene, best.time_step, task=self.task)
 
     def __repr__(self) -> str:
         found, stages = "no design yet", self.settings.stages

@@ -14,6 +14,7 @@ from mpmopt.assess import refinement
 from mpmopt.assess.threshold import post_processed
 from mpmopt.design.chain import non_discreteness
 from mpmopt.design.problem import Problem
+from mpmopt.design.task import DEFAULT_TASK, FEASIBLE, Task
 from mpmopt.errors import DesignError, SceneError, SimulationError
 from mpmopt.optimisation.history import Candidate, Iteration, Optimisation, StageState
 from mpmopt.optimisation.mma import MovingAsymptotes
@@ -41,12 +42,14 @@ def optimise(
     start: NDArray[np.float64] | Sequence[float],
     callbacks: Iterable[Callback] | Callback = (),
     checkpointing: Checkpointing | None = None,
+    task: Task = DEFAULT_TASK,
 ) -> Optimisation:
-    """Maximise the distance travelled, stage by stage.
+    """Maximise a task's objective subject to its constraints, stage by stage.
 
     An evaluation that fails steps back to the stage's incumbent and halves the move limit, which
     then recovers slowly. A stage of which no design ran yet takes the best of the one before, and
-    if that fails too, halves its time step.
+    if that fails too, halves its time step. A design that meets all constraints is better than any
+    that does not.
 
     Parameters
     ----------
@@ -57,6 +60,8 @@ def optimise(
     callbacks : iterable of callable, or one
         Called after each evaluation and once at the end.
     checkpointing : Checkpointing, optional
+    task : Task, optional
+        Default: the displacement, without constraints.
 
     Raises
     ------
@@ -69,10 +74,10 @@ def optimise(
     StorageError
         If checkpoints cannot be stored.
     """
-    return go_on(begin(scene, settings, start), callbacks, checkpointing)
+    return go_on(begin(scene, settings, start, task), callbacks, checkpointing)
 
 
-def begin(scene: Scene, settings: Settings, start: Any) -> Optimisation:
+def begin(scene: Scene, settings: Settings, start: Any, task: Task = DEFAULT_TASK) -> Optimisation:
     """An optimisation before its first evaluation, for `go_on`; see `optimise`.
 
     Raises
@@ -83,11 +88,11 @@ def begin(scene: Scene, settings: Settings, start: Any) -> Optimisation:
     instance("optimise", "scene", scene, Scene)
     instance("optimise", "settings", settings, Settings, HOW)
     scenes = [stage.scene(scene) for stage in settings.stages]
-    first = Problem(scenes[0])
+    first = Problem(scenes[0], task=task)
     if first.size == 0:
         raise DesignError("there is nothing to design: give a Design or an Actuator")
     check_body_fits(scene)
-    return Optimisation(scene, settings, first.join(*first.split(start)))
+    return Optimisation(scene, settings, task, first.join(*first.split(start)))
 
 
 def check_body_fits(scene: Scene) -> None:
@@ -174,14 +179,39 @@ def go_on(
         logger.info("stage %d: %s", run.stage, run.reason)
         run.stage += not run.gave_up
     reached = run.stage + run.gave_up
-    run.stop_reason = f"Stage {reached} of {len(stages)} was the last: {run.reason}"
+    run.stop_reason = f"Stage {reached} of {len(stages)} was the last: {run.reason}{_missed(run)}"
     report()
     return run
 
 
-def _order(item: Iteration) -> tuple[float, float, float]:
+def _missed(run: Optimisation) -> str:
+    """Which constraints the best design misses, and by how much; empty if it meets all."""
+    if not run.best or not run.result.violation:
+        return ""
+    pairs = zip(run.task.subject_to, run.result.constraints)
+    missed = [
+        f"{constraint} is missed by {constraint.g(value) * constraint.scale:.3g}"
+        for constraint, value in pairs
+        if constraint.g(value) > FEASIBLE
+    ]
+    text = f" No design met all constraints: of the best {', '.join(missed)}."
+    logger.warning(text.strip())
+    return text
+
+
+def _rank(item: Iteration) -> tuple[float, float]:
+    """What designs are compared by as they are: first whether they meet the constraints."""
+    return -item.violation, item.objective
+
+
+def _order(item: Iteration) -> tuple[float, float, float, float]:
     """What solid designs are compared by."""
-    return item.counted, float(np.nan_to_num(item.post_processed, nan=-np.inf)), item.objective
+    return (
+        -item.violation,
+        item.counted,
+        float(np.nan_to_num(item.post_processed, nan=-np.inf)),
+        item.objective,
+    )
 
 
 class _Ascent:
@@ -211,15 +241,18 @@ class _Ascent:
         self.values: list[float] = []
         self.failures = 0
         self.incumbent: Candidate | None = None
-        self.gradient = self.incumbent_gradient = np.empty(0)
+        self.gradients = self.incumbent_gradients = np.empty((0, 0))
+        self.multipliers = len(run.task.subject_to) * (0.0,)
         if state:
             self.mma.restore(state.mma)
             self.values, self.failures = state.values.tolist(), state.failures
-            self.gradient = state.gradient
-            self.incumbent, self.incumbent_gradient = state.incumbent, state.incumbent_gradient
+            self.gradients = state.gradients
+            self.incumbent, self.incumbent_gradients = state.incumbent, state.incumbent_gradients
 
     def _pose(self, time_step: float | None) -> None:
-        self.problem = self.stage.problem(self.run.scene, time_step, self.checkpointing)
+        self.problem = self.stage.problem(
+            self.run.scene, time_step, self.checkpointing, self.run.task
+        )
 
     def state(self) -> StageState:
         """All that the next step depends on."""
@@ -227,9 +260,9 @@ class _Ascent:
             time_step=self.problem.scene.time_step,
             failures=self.failures,
             values=np.array(self.values),
-            gradient=self.gradient,
+            gradients=self.gradients,
             incumbent=self.incumbent,
-            incumbent_gradient=self.incumbent_gradient,
+            incumbent_gradients=self.incumbent_gradients,
             mma=self.mma.state(),
         )
 
@@ -266,17 +299,28 @@ class _Ascent:
         if self.failures and self.incumbent is not None:
             mma.reset()
             mma.move_limit /= 2.0
-            return self._move(self.incumbent.x, self.incumbent.objective, self.incumbent_gradient)
-        went_back = len(self.values) > 1 and self.values[-1] < self.values[-2]
-        factor = SHORTEN if went_back and self.run.settings.adapt_move_limit else LENGTHEN
+            return self._move(self.incumbent, self.incumbent_gradients)
+        factor = SHORTEN if self._went_back() and self.run.settings.adapt_move_limit else LENGTHEN
         mma.move_limit = min(self.stage.move_limit, factor * mma.move_limit)
-        return self._move(x, self.values[-1], self.gradient)
+        assert self.run.last is not None
+        return self._move(self.run.last, self.gradients)
 
-    def _move(
-        self, x: NDArray[np.float64], value: float, gradient: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """The step of the moving asymptotes from x."""
-        return self.mma.step(x, -value / self.width, -gradient / self.width)
+    def _went_back(self) -> bool:
+        """Whether the last one that ran is worse than the one before."""
+        done = [i for i in self.run.history if i.stage == self.run.stage and not i.failure][-2:]
+        return len(done) == 2 and _rank(done[1]) < _rank(done[0])
+
+    def _move(self, item: Candidate, gradients: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The step of the moving asymptotes from a design."""
+        f, dfdx = -item.objective / self.width, -gradients[0] / self.width
+        constraints = self.run.task.subject_to
+        if not constraints:
+            return self.mma.step(item.x, f, dfdx)
+        scale = np.array([constraint.scale for constraint in constraints])
+        g = [constraint.g(value) for constraint, value in zip(constraints, item.constraints)]
+        x = self.mma.step(item.x, f, dfdx, g, gradients[1:] / scale[:, None])
+        self.multipliers = tuple((self.mma.multipliers * self.width / scale).tolist())
+        return x
 
     def _best_before(self) -> NDArray[np.float64] | None:
         """The best design of the stage before, on this stage's grid."""
@@ -290,14 +334,17 @@ class _Ascent:
     def _evaluate(self, x: NDArray[np.float64]) -> None:
         """Value and gradient, recorded, even of a simulation that failed."""
         run = self.run
-        value, failure = np.nan, ""
-        gradient: NDArray[np.float64] = np.full(x.size, np.nan)
+        value, failure, violation = np.nan, "", np.nan
+        constraints = np.full(len(run.task.subject_to), np.nan)
+        gradients: NDArray[np.float64] = np.full((1, x.size), np.nan)
         problem, halved = self.problem, self.problem.halvings
         indicators = Indicators(*len(Indicators._fields) * (np.nan,))
         time_step = problem.scene.time_step / 2.0**halved
         try:
             evaluation = problem.evaluate(x)
-            value, gradient = evaluation.value, evaluation.gradient
+            value, constraints = evaluation.value, evaluation.constraints
+            gradients = evaluation.gradients
+            violation = run.task.violation(constraints)
             halved, indicators = evaluation.halved, evaluation.indicators
             time_step = evaluation.time_step
         except SimulationError as error:
@@ -307,14 +354,15 @@ class _Ascent:
         if self.stage.solid and not failure:
             solid = self._without_void(post_processed, problem.at(time_step), x)
             best = run.best.get(run.stage)
-            hopeful = solid > (best.counted if best else -np.inf)
+            least = (-best.violation, best.counted) if best else (-np.inf, -np.inf)
+            hopeful = (-violation, solid) > least
             if self.stage.refined and hopeful:
                 refined = self._without_void(refinement.least, problem.at(time_step), x)
                 refined = -np.inf if np.isnan(refined) else refined
         before = run.last.x if run.last else x
         if before.size != x.size:  # another grid
             before = x
-        free = np.where(gradient > 0.0, x < 1.0, x > -1.0)
+        free = np.where(gradients[0] > 0.0, x < 1.0, x > -1.0)
         gamma = self.problem.gamma(x)
         candidate = Candidate(
             stage=run.stage,
@@ -325,7 +373,7 @@ class _Ascent:
             gamma=gamma,
             objective=value,
             non_discreteness=non_discreteness(gamma),
-            projected_gradient=float(np.abs(gradient * free).max()),
+            projected_gradient=float(np.abs(gradients[0] * free).max()),
             step=float(np.abs(x - before).max() / 2.0),
             seconds=time.monotonic() - self.began,
             post_processed=solid,
@@ -337,25 +385,28 @@ class _Ascent:
             stretch=indicators.stretch,
             energy=indicators.energy,
             gap=indicators.gap,
+            violation=violation,
+            constraints=tuple(constraints.tolist()),
+            multipliers=self.multipliers,
             failure=failure,
         )
-        self._record(candidate, gradient)
+        self._record(candidate, gradients)
         self.report()
 
-    def _record(self, candidate: Candidate, gradient: NDArray[np.float64]) -> None:
+    def _record(self, candidate: Candidate, gradients: NDArray[np.float64]) -> None:
         run = self.run
         run.first = run.first or candidate
         run.last = candidate
         run.history.append(Iteration(**candidate.numbers()))
         if candidate.failure:
             self.failures += 1
-            self.gradient = np.empty(0)
+            self.gradients = np.empty((0, 0))
         else:
             self.failures = 0
             self.values.append(candidate.objective)
-            self.gradient = gradient
-            if self.incumbent is None or candidate.objective > self.incumbent.objective:
-                self.incumbent, self.incumbent_gradient = candidate, gradient
+            self.gradients = gradients
+            if self.incumbent is None or _rank(candidate) > _rank(self.incumbent):
+                self.incumbent, self.incumbent_gradients = candidate, gradients
             if self._is_best(candidate):
                 run.best[candidate.stage] = candidate
         run.stage_state = self.state()
@@ -366,7 +417,7 @@ class _Ascent:
         if best is None:
             return True
         if not self.stage.solid:
-            return item.objective > best.objective
+            return _rank(item) > _rank(best)
         if self.stage.refined and np.isnan(item.refined):
             return False
         return _order(item) > _order(best)
@@ -395,7 +446,7 @@ class _Ascent:
         if count >= max(settings.least, window + 1):
             change = abs(np.mean(values[-window:]) - np.mean(values[-window - 1 : -1]))
             limit = settings.tolerance * self.width
-            if change <= limit:
+            if change <= limit and not self.run.history[-1].violation:
                 last = self.run.history[-1]
                 return (
                     f"the mean objective over {window} iterations changed by {change:.1e} <= "

@@ -3,7 +3,7 @@
 Layout (version 5)::
 
     attributes       format, version, stage, reason, gave_up, stop_reason; as JSON: scene,
-                     settings, versions, summary
+                     settings, task, versions, summary
     x                the design that the stage began with
     history/NAME     one entry per evaluation: objective, beta, non_discreteness, step, ...
     best/            the best of all, with gamma, phi, a, theta, b; attribute stage
@@ -32,6 +32,7 @@ from numpy.typing import NDArray
 
 import mpmopt
 from mpmopt.design.problem import Variables
+from mpmopt.design.task import Task
 from mpmopt.errors import RunFileError, StorageError
 from mpmopt.io.checksums import LARGEST, SEAL, file_in_memory, refusing, sealed, unsealed
 from mpmopt.io.files import replace_file
@@ -42,6 +43,8 @@ from mpmopt.validation import instance, place
 
 FORMAT, VERSION = "mpmopt run", 5
 WHOLE = tuple(f.name for f in dataclasses.fields(Iteration) if f.type == "int")
+# For each constraint one.
+TUPLES = tuple(f.name for f in dataclasses.fields(Iteration) if f.type == "tuple[float, ...]")
 COLUMNS = tuple(f.name for f in dataclasses.fields(Iteration) if f.type in ("int", "float"))
 
 PLACE = ("stage", "reason", "gave_up", "stop_reason")  # where a run stands
@@ -112,6 +115,7 @@ def write(
 def _fill(file: h5py.File, run: Optimisation) -> None:
     file.attrs["format"], file.attrs["version"] = FORMAT, VERSION
     file.attrs["scene"] = run.scene.to_json()
+    file.attrs["task"] = run.task.to_json()
     file.attrs["settings"] = json.dumps(dataclasses.asdict(run.settings))
     file.attrs["versions"] = json.dumps(versions())
     for name in PLACE:
@@ -122,6 +126,10 @@ def _fill(file: h5py.File, run: Optimisation) -> None:
     for name in COLUMNS:
         column = np.array([getattr(item, name) for item in run.history], dtype=float)
         file.create_dataset(f"history/{name}", data=column, dtype="f8")
+    for name in TUPLES:
+        rows = np.array([getattr(item, name) for item in run.history], dtype=float)
+        shape = (len(run.history), len(run.task.subject_to))
+        file.create_dataset(f"history/{name}", data=rows.reshape(shape), dtype="f8")
     file.create_dataset(
         "history/failure", data=[i.failure for i in run.history], dtype=h5py.string_dtype()
     )
@@ -144,12 +152,15 @@ def _write_candidate(parent: h5py.Group, name: str, item: Candidate | None) -> N
     group.create_dataset("x", data=item.x, dtype="f8")
     group.create_dataset("gamma", data=item.gamma, dtype="f8")
     for key, value in item.numbers().items():
-        group.attrs[key] = value
+        if key in TUPLES:
+            group.create_dataset(key, data=value, dtype="f8")
+        else:
+            group.attrs[key] = value
 
 
 def _write_stage(group: h5py.Group, state: StageState) -> None:
     group.attrs["time_step"], group.attrs["failures"] = state.time_step, state.failures
-    for name in ("values", "gradient", "incumbent_gradient"):
+    for name in ("values", "gradients", "incumbent_gradients"):
         group.create_dataset(name, data=getattr(state, name), dtype="f8")
     _write_candidate(group, "incumbent", state.incumbent)
     for name, value in state.mma.items():
@@ -197,15 +208,17 @@ def _read(file: h5py.File, path: Path) -> RunFile:
             f"{VERSION}; its versions: {file.attrs.get('versions')}"
         )
     settings = Settings.from_dict(json.loads(file.attrs["settings"]))
+    task = Task.from_json(file.attrs["task"])
     run = Optimisation(
         scene=Scene.from_json(file.attrs["scene"]),
         settings=settings,
+        task=task,
         x=_numbers(file, "x"),
         stage=int(file.attrs["stage"]),
         reason=str(file.attrs["reason"]),
         gave_up=bool(file.attrs["gave_up"]),
         best=_read_best(file.get("stages", {}), len(settings.stages)),
-        history=_read_history(file["history"]),
+        history=_read_history(file["history"], len(task.subject_to)),
         first=_read_candidate(file, "first"),
         last=_read_candidate(file, "last"),
         stage_state=_read_stage(file["stage"]) if "stage" in file else None,
@@ -221,9 +234,14 @@ def _read(file: h5py.File, path: Path) -> RunFile:
     )
 
 
-def _read_history(group: h5py.Group) -> list[Iteration]:
+def _read_history(group: h5py.Group, constraints: int) -> list[Iteration]:
     columns: dict[str, Any] = {name: _numbers(group, name).tolist() for name in COLUMNS}
     columns["failure"] = group["failure"].asstr()[:].tolist()
+    for name in TUPLES:
+        rows = _numbers(group, name, 2)
+        if rows.shape[1] != constraints:
+            raise ValueError(f"{name} of {rows.shape[1]} constraints, the task has {constraints}")
+        columns[name] = list(map(tuple, rows.tolist()))
     for name in WHOLE:
         columns[name] = [int(value) for value in columns[name]]
     if len({len(column) for column in columns.values()}) != 1:
@@ -247,6 +265,7 @@ def _read_candidate(parent: h5py.Group, name: str) -> Candidate | None:
     group = parent[name]
     numbers: dict[str, Any] = {key: float(group.attrs[key]) for key in COLUMNS}
     numbers.update({key: int(group.attrs[key]) for key in WHOLE})
+    numbers.update({key: tuple(_numbers(group, key).tolist()) for key in TUPLES})
     failure = str(group.attrs["failure"])
     return Candidate(
         **numbers, failure=failure, x=_numbers(group, "x"), gamma=_numbers(group, "gamma")
@@ -258,21 +277,20 @@ def _read_stage(group: h5py.Group) -> StageState:
         time_step=float(group.attrs["time_step"]),
         failures=int(group.attrs["failures"]),
         values=_numbers(group, "values"),
-        gradient=_numbers(group, "gradient"),
+        gradients=_numbers(group, "gradients", 2),
         incumbent=_read_candidate(group, "incumbent"),
-        incumbent_gradient=_numbers(group, "incumbent_gradient"),
+        incumbent_gradients=_numbers(group, "incumbent_gradients", 2),
         mma={name: item[()] for name, item in group["mma"].items()},
     )
     incumbent = 0 if state.incumbent is None else state.incumbent.x.size
-    if state.incumbent_gradient.size != incumbent or (
-        state.gradient.size and not state.values.size
-    ):
+    wrong = state.incumbent_gradients.shape[1] != incumbent
+    if wrong or (state.gradients.size and not state.values.size):
         raise ValueError("a stage whose values, gradients and designs do not fit together")
     return state
 
 
-def _numbers(group: h5py.Group, name: str) -> NDArray[np.float64]:
+def _numbers(group: h5py.Group, name: str, axes: int = 1) -> NDArray[np.float64]:
     dataset = group[name]
-    if not isinstance(dataset, h5py.Dataset) or dataset.dtype != np.float64 or dataset.ndim != 1:
-        raise ValueError(f"{group.name}/{name} is no column of 64-bit numbers")
+    if not isinstance(dataset, h5py.Dataset) or dataset.dtype != np.float64 or dataset.ndim != axes:
+        raise ValueError(f"{group.name}/{name} has not {axes} axes of 64-bit numbers")
     return np.asarray(dataset[:], dtype=float)

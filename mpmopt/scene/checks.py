@@ -143,7 +143,7 @@ def check_mirror(scene: Scene) -> None:
     for what, vector in (("gravity", scene.gravity), ("direction", scene.direction)):
         if vector[k] != 0.0:
             raise SceneError(f"{name}: {what} {vector} has a component across it, must have 0")
-    there = {(type(region), scene.lattice(region)) for region in scene.body}
+    there = {(type(r), scene.lattice(r), scene.material_of(r)) for r in scene.body}
     for region in scene.body:
         low, high = mirror.image(region.lower), mirror.image(region.upper)
         corners = (
@@ -152,7 +152,7 @@ def check_mirror(scene: Scene) -> None:
         )
         image = scene.lattice(Region(*corners))
         where = f"{type(region).__name__} {region.lower} to {region.upper}"
-        if (type(region), image) not in there:
+        if (type(region), image, scene.material_of(region)) not in there:
             raise SceneError(f"{name}: {where} has no mirror image in the body; add it")
         if isinstance(region, Actuator) and (
             image != scene.lattice(region) or region.stress[0][1] != 0.0
@@ -197,6 +197,7 @@ def check_formulation(scene: Scene) -> None:
         return
     for what, there, cure in (
         (f"{len(scene.walls)} walls", scene.walls, "stand the body on a Ground"),
+        (f"{len(scene.clamps)} clamps", scene.clamps, "hold the body otherwise"),
         (f"blend_time = {scene.blend_time:g}", scene.blend_time, "give the material a viscosity"),
     ):
         if there:
@@ -206,15 +207,18 @@ def check_formulation(scene: Scene) -> None:
 
 
 def check_stability(scene: Scene) -> None:
-    if scene.time_step > scene.largest_time_step:
+    for region in scene.body:
+        limit = scene.material_of(region).largest_time_step(scene.grid.dx)
+        if scene.time_step <= limit:
+            continue
         raise SceneError(
             f"Scene: time_step = {scene.time_step:g} is over the stability limit "
-            f"{scene.largest_time_step:g} of a single particle; take a smaller step, larger "
-            "cells or a void density that is not below the void stiffness"
+            f"{limit:g} of a single particle of {region}; take a smaller step, larger "
+            "cells, a void density that is not below the void stiffness, or less viscosity"
         )
     for actuator in scene.actuators:
         largest = LARGEST_SIGNAL * np.abs(np.linalg.eigvalsh(actuator.stress)).max()
-        bearable = scene.material.elliptic_limit
+        bearable = scene.material_of(actuator).elliptic_limit
         if bearable - largest <= 0.0:
             raise SceneError(
                 f"Scene: ellipticity can be lost: the material bears actuation stresses above "

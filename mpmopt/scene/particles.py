@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,21 +33,44 @@ class Particles:
         Whether a particle's material is designed; the others are solid.
     actuator : (N,) array of int
         Index of the particle's actuator, -1 if it has none.
+    region : (N,) array of int
+        Index of the particle's region of the scene's body.
     """
 
     position: NDArray[np.float64]
     volume: NDArray[np.float64]
     designed: NDArray[np.bool_]
     actuator: NDArray[np.int64]
+    region: NDArray[np.int64]
 
     def __post_init__(self) -> None:
-        own(self, "position", "volume", "designed", "actuator")
+        own(self, "position", "volume", "designed", "actuator", "region")
 
     def subset(self, keep: NDArray[np.bool_]) -> Particles:
         """The particles that `keep` (N,) marks, in the same order."""
         return Particles(
-            self.position[keep], self.volume[keep], self.designed[keep], self.actuator[keep]
-        )
+            self.position[keep], self.volume[keep], self.designed[keep], self.actuator[keep],
+            self.region[keep],
+        )  # fmt: skip
+
+
+class Solids(NamedTuple):
+    """What `Material` has of the same name, of the solid that each of N particles is made of."""
+
+    density: NDArray[np.float64]  # (N,)
+    void_density: NDArray[np.float64]  # (N,)
+    void_stiffness: NDArray[np.float64]  # (N,)
+
+
+def of_solid(scene: Scene, particles: Particles, name: str) -> NDArray[np.float64]:
+    """An attribute of the scene's materials, by its name, of each particle's solid (N,)."""
+    values = [getattr(scene.material_of(region), name) for region in scene.body]
+    return np.array(values, dtype=float)[particles.region]
+
+
+def solids(scene: Scene, particles: Particles) -> Solids:
+    """Density and floors of the solid that each particle is made of."""
+    return Solids(*(of_solid(scene, particles, name) for name in Solids._fields))
 
 
 def discretise(scene: Scene, whole: bool = False) -> Particles:
@@ -60,15 +83,16 @@ def discretise(scene: Scene, whole: bool = False) -> Particles:
         Lay out both halves of a scene with a mirror, not only the simulated one.
     """
     spacing = scene.grid.dx / scene.particles_per_cell
-    columns, rows, designed, actuator = [], [], [], []
+    columns, rows, designed, actuator, regions = [], [], [], [], []
     actuators = 0
-    for region in scene.body:
+    for number, region in enumerate(scene.body):
         (i0, j0), (i1, j1) = scene.lattice(region)
         i, j = (index.ravel() for index in np.meshgrid(range(i0, i1), range(j0, j1)))
         columns.append(i)
         rows.append(j)
         designed.append(np.full(i.size, isinstance(region, Design)))
         actuator.append(np.full(i.size, actuators if isinstance(region, Actuator) else -1))
+        regions.append(np.full(i.size, number))
         actuators += isinstance(region, Actuator)
     i, j = np.concatenate(columns), np.concatenate(rows)
     order = np.lexsort((j, i))
@@ -78,6 +102,7 @@ def discretise(scene: Scene, whole: bool = False) -> Particles:
         volume=np.full(len(position), spacing**2),
         designed=np.concatenate(designed)[order],
         actuator=np.concatenate(actuator)[order].astype(np.int64),
+        region=np.concatenate(regions)[order].astype(np.int64),
     )
     if scene.mirror is None or whole:
         return particles

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import islice
 from typing import Any, ClassVar, Literal
 
@@ -101,6 +101,38 @@ class Material(Checked):
             if getattr(self, name) > 1.0:
                 raise SceneError(f"Material: {name} = {getattr(self, name)!r} must be at most 1")
 
+    @classmethod
+    def from_young(cls, young: float, poisson: float, density: float, **others: float) -> Material:
+        """The material with a Young's modulus and Poisson's ratio, in plane strain.
+
+        lambda = E nu / ((1 + nu) (1 - 2 nu)) and mu = E / (2 (1 + nu)), those of the solid of
+        which the plane is a section.
+
+        Parameters
+        ----------
+        young : float
+            E > 0 (stress).
+        poisson : float
+            nu, from 0 to below 0.5, where the solid is incompressible and no step is short enough.
+        density : float
+        **others
+            Other fields of `Material`.
+
+        Raises
+        ------
+        SceneError
+            If a number makes no sense.
+        """
+        E = number("Material", "young", young, above=0.0)
+        nu = number("Material", "poisson", poisson)
+        if not 0.0 <= nu < 0.5:
+            raise SceneError(
+                f"Material: poisson = {nu!r} must be from 0 to below 0.5; take 0.45 for what is "
+                "nearly incompressible"
+            )
+        mu = E / (2.0 * (1.0 + nu))
+        return cls(2.0 * mu * nu / (1.0 - 2.0 * nu), mu, density, **others)
+
     @property
     def wave_speed(self) -> float:
         """Speed of pressure waves, sqrt((lambda + 2 mu) / rho)."""
@@ -138,15 +170,23 @@ class Region(Checked):
     ----------
     lower, upper : (float, float)
         Lower left and upper right corner.
+    material : Material, optional
+        What it is made of, by keyword; None: the scene's.
     """
 
     kind: ClassVar[str]
 
     lower: Vector
     upper: Vector
+    material: Material | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         owner = type(self).__name__
+        if self.material is not None and not isinstance(self.material, Material):
+            raise SceneError(
+                f"{owner}: material = {shown(self.material)} must be a Material, or None for the "
+                "scene's"
+            )
         self._set(
             lower=vector(owner, "lower", self.lower), upper=vector(owner, "upper", self.upper)
         )

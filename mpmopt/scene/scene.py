@@ -17,6 +17,7 @@ from mpmopt.scene.checks import (
     check_stability,
     check_walls,
 )
+from mpmopt.scene.clamp import Clamp, check_clamps
 from mpmopt.scene.ground import Ground, Layer, check_ground
 from mpmopt.scene.parts import (
     Actuator,
@@ -33,7 +34,7 @@ from mpmopt.scene.parts import (
 from mpmopt.scene.serial import parsed, written
 from mpmopt.validation import MOST, count, number
 
-# Of the limit of an isolated particle in the updated formulation, which the other one bears.
+# Share of the limit of an isolated particle in the updated formulation.
 LAGRANGIAN_LIMIT = 0.8
 Formulation = Literal["updated", "total"]
 MOST_PASSES = 200  # of the design filter
@@ -45,8 +46,8 @@ MOST_PARTS = 1000  # of the body, and walls
 class Scene(Checked):
     """One body, what surrounds it, and the way it shall go.
 
-    Units are free but must agree: with metres, seconds and kilograms per square metre, stresses
-    are in newtons per metre.
+    Units are free but must agree: with metres, seconds and kilograms per cubic metre, stresses are
+    in pascals, and forces and energies are those of a metre of depth.
 
     Parameters
     ----------
@@ -59,7 +60,9 @@ class Scene(Checked):
         `Design`, `Solid` and `Actuator` rectangles that do not overlap.
     walls : tuple of Wall, optional
     ground : tuple of Ground, optional
+    clamps : tuple of Clamp, optional
     material : Material, optional
+        Of the regions that have none of their own.
     gravity : (float, float), optional
     direction : (float, float), optional
         Unit vector e of the objective.
@@ -108,12 +111,18 @@ class Scene(Checked):
     formulation: Formulation = "updated"
     transient: float = 0.0
     ground: tuple[Ground, ...] = ()
+    clamps: tuple[Clamp, ...] = ()
 
     def __post_init__(self) -> None:
         for name, kind in (("grid", Grid), ("material", Material)):
             if not isinstance(getattr(self, name), kind):
                 raise SceneError(f"Scene: {name} must be a {kind.__name__}")
-        for name, part in (("body", Region), ("walls", Wall), ("ground", Ground)):
+        for name, part in (
+            ("body", Region),
+            ("walls", Wall),
+            ("ground", Ground),
+            ("clamps", Clamp),
+        ):
             value = getattr(self, name)
             if not isinstance(value, (tuple, list)) or not all(isinstance(v, part) for v in value):
                 raise SceneError(f"Scene: {name} must be a tuple of {part.__name__} objects")
@@ -171,6 +180,7 @@ class Scene(Checked):
         check_size(self)
         check_walls(self)
         check_ground(self)
+        check_clamps(self)
         check_mirror(self)
         check_formulation(self)
         check_stability(self)
@@ -189,6 +199,9 @@ class Scene(Checked):
             f"{ground.friction})"
             for ground in self.ground
         )
+        if self.clamps:
+            moved = sum(bool(clamp.path) for clamp in self.clamps)
+            ground += f"; {len(self.clamps)} clamps, of which {moved} move"
         mirror = ""
         if self.mirror is not None:
             mirror = f", symmetric about {self.mirror.axis} = {self.mirror.position:g}"
@@ -227,10 +240,11 @@ class Scene(Checked):
     def largest_time_step(self) -> float:
         """Stability limit of an isolated particle (`Material.largest_time_step`).
 
-        In the total Lagrangian formulation four particles of a cell alone bear `LAGRANGIAN_LIMIT`.
+        A particle in the total Lagrangian formulation bears 0.9 of it: `LAGRANGIAN_LIMIT` counts.
         """
         layers = [layer.stiffness / layer.thickness for layer in self.layers]
-        limit = self.material.largest_time_step(self.grid.dx, max(layers, default=0.0))
+        layer = max(layers, default=0.0)
+        limit = min(each.largest_time_step(self.grid.dx, layer) for each in self.materials)
         return LAGRANGIAN_LIMIT * limit if self.formulation == "total" else limit
 
     @property
@@ -248,8 +262,22 @@ class Scene(Checked):
 
     @property
     def courant(self) -> float:
-        """Courant number of pressure waves in the solid, c_p dt / dx."""
-        return self.material.wave_speed * self.time_step / self.grid.dx
+        """Courant number of pressure waves in the solid, c_p dt / dx; the fastest count."""
+        return self.wave_speed * self.time_step / self.grid.dx
+
+    @property
+    def wave_speed(self) -> float:
+        """Speed of the fastest pressure waves (`Material.wave_speed`)."""
+        return max(material.wave_speed for material in self.materials)
+
+    @property
+    def materials(self) -> tuple[Material, ...]:
+        """What the body is made of, each once."""
+        return tuple(dict.fromkeys(self.material_of(region) for region in self.body))
+
+    def material_of(self, region: Region) -> Material:
+        """A region's own material, or the scene's."""
+        return self.material if region.material is None else region.material
 
     @property
     def actuators(self) -> tuple[Actuator, ...]:
@@ -304,6 +332,8 @@ class Scene(Checked):
     ) -> Scene:
         """The same scene and duration with another time step, other floors, or wider cells.
 
+        Floors are those of all materials.
+
         Parameters
         ----------
         time_step, void_density, void_stiffness : float, optional
@@ -319,6 +349,12 @@ class Scene(Checked):
         floors = {"void_density": void_density, "void_stiffness": void_stiffness}
         given = {name: value for name, value in floors.items() if value is not None}
         steps, material = self.steps, dataclasses.replace(self.material, **given)
+        body = tuple(
+            region
+            if region.material is None
+            else dataclasses.replace(region, material=dataclasses.replace(region.material, **given))
+            for region in self.body
+        )
         if time_step is None:
             time_step = self.time_step
         else:
@@ -341,7 +377,7 @@ class Scene(Checked):
         nx, ny = (n // coarsening for n in self.grid.cells)
         grid = Grid((nx, ny), self.grid.dx * coarsening)
         return dataclasses.replace(
-            self, grid=grid, time_step=time_step, steps=steps, material=material
+            self, grid=grid, time_step=time_step, steps=steps, body=body, material=material
         )
 
     def to_json(self) -> str:

@@ -95,6 +95,7 @@ class Segment:
         """Advance from step `first`, whose state is in slot 0, to step `last`."""
         simulation = self.simulation
         signal = simulation.signal[first:last]
+        parameters = simulation.parameters_of_steps(first, last)
         reached, steps = 0, last - first
         while reached < steps:
             stop = min(steps, reached + simulation.steps_per_call)
@@ -108,7 +109,7 @@ class Segment:
                 reached,
                 stop,
                 simulation.data,
-                simulation.parameters,
+                parameters,
                 signal,
                 self.scratch,
             )
@@ -168,9 +169,10 @@ def _failure(
             f"{height - margin:g})"
         )
     scene = simulation.scene
+    floor = min(material.void_density for material in scene.materials)
     hint = (
         f"take a smaller time step (now {scene.time_step:g}, Courant {scene.courant:.2g}), a "
-        f"higher void density (now {scene.material.void_density:g}), weaker actuation"
+        f"higher void density (now {floor:g}), weaker actuation"
     )
     if end == kernels.ESCAPED:
         hint += ", or a larger grid"

@@ -26,9 +26,13 @@ def parameters_of(scene: Scene) -> kernels.Parameters:
             -1, len(contact.COLUMNS)
         ),
         ground=_ground_of(scene),
+        clamps=np.array([clamp.rows(scene) for clamp in scene.clamps])
+        .reshape(-1, scene.steps, 6)
+        .swapaxes(0, 1)
+        .copy(),
         mirror_axis=-1 if scene.mirror is None else scene.mirror.normal,
         mirror_node=0 if scene.mirror is None else round(scene.mirror.position / dx),
-        viscous=scene.material.viscosity > 0.0,
+        viscous=any(material.viscosity > 0.0 for material in scene.materials),
         keep=math.exp(-scene.time_step / scene.blend_time) if scene.blend_time else 0.0,
         mass_tolerance=0.0,
     )
