@@ -16,6 +16,7 @@ from mpmopt.design.term import Outcome
 from mpmopt.errors import DesignError, SimulationError
 from mpmopt.scene import Scene
 from mpmopt.scene.particles import discretise, of_solid
+from mpmopt.simulation.formulations import simulation_of
 from mpmopt.simulation.simulation import Simulation
 from mpmopt.validation import shown
 
@@ -60,7 +61,7 @@ def solid_body(scene: Scene, keep: NDArray[np.bool_], variables: Variables) -> S
     there[particles.designed] = keep
     particles = particles.subset(there)
     ones = np.ones(there.sum())
-    return Simulation(
+    return simulation_of(
         scene,
         particles,
         density=of_solid(scene, particles, "density"),

@@ -21,6 +21,7 @@ from mpmopt.scene import Scene
 from mpmopt.scene.particles import discretise, nearest_designed
 from mpmopt.simulation.buffers import Memory
 from mpmopt.simulation.checkpoints import Checkpointing
+from mpmopt.simulation.formulations import simulation_of
 from mpmopt.simulation.indicators import Indicators
 from mpmopt.simulation.simulation import Gradient, Precision, Simulation, check_precision
 from mpmopt.validation import count, instance, share
@@ -247,7 +248,7 @@ class Problem:
         """The simulation of a design."""
         phi, a, theta, b = self.split(x)
         present, field = self.present(phi), self.chain.field(phi)
-        return Simulation(
+        return simulation_of(
             self.scene,
             self.particles.subset(present),
             field.density[present],

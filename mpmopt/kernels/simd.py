@@ -64,6 +64,21 @@ def positive(x):
     return bool(np.all(np.real(x) > 0.0))
 
 
+def above(x, limit):
+    """Which real parts of a record are above a number, as 1 and 0."""
+    return (np.real(x) > limit).astype(float)
+
+
+def chosen(which, x, y):
+    """Of two records, numbers of x where `which` is 1, else of y."""
+    return np.where(which > 0.5, x, y)
+
+
+def reciprocal(x):
+    """One over each number of a record."""
+    return 1.0 / x
+
+
 def logarithm(x):
     """The natural logarithms of a record of positive numbers."""
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -473,6 +488,30 @@ def _getitem(record, k):
 
 
 @intrinsic
+def _above(typingctx, x, limit):
+    kind = Register(types.float64 if x.dtype == types.complex128 else x.dtype, x.lanes)
+
+    def generate(context, builder, signature, arguments):
+        value = _real_parts(builder, x, arguments[0])
+        truth = builder.fcmp_ordered(">", value, arguments[1])
+        return builder.uitofp(truth, _vector(kind))
+
+    return kind(x, limit), generate
+
+
+@intrinsic
+def _chosen(typingctx, which, x, y):
+    def generate(context, builder, signature, arguments):
+        mask = arguments[0]
+        if x.dtype == types.complex128:
+            mask = _shuffle(builder, mask, mask, [k // 2 for k in range(2 * x.lanes)])
+        half = ir.Constant(mask.type, mask.type.count * [0.5])
+        return builder.select(builder.fcmp_ordered(">", mask, half), *arguments[1:])
+
+    return x(which, x, y), generate
+
+
+@intrinsic
 def _positive(typingctx, record):
     def generate(context, builder, signature, arguments):
         value = _real_parts(builder, record, arguments[0])
@@ -620,9 +659,26 @@ def _overload_greatest(x, y):
     return lambda x, y: _greatest(x, y)
 
 
+@overload(above)
+def _overload_above(x, limit):
+    return lambda x, limit: _above(x, _as(limit, real(x)))
+
+
+@overload(chosen)
+def _overload_chosen(which, x, y):
+    return lambda which, x, y: _chosen(which, x, y)
+
+
 @overload(positive)
 def _overload_positive(x):
     return lambda x: _positive(x)
+
+
+@overload(reciprocal)
+def _overload_reciprocal(x):
+    if x.dtype != types.complex128:
+        return lambda x: _divide(_as(1.0, x), x)
+    return lambda x: _pack((1.0 / x[0], 1.0 / x[1], 1.0 / x[2], 1.0 / x[3]))
 
 
 @overload(logarithm)

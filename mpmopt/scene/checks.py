@@ -188,6 +188,24 @@ def check_mirror(scene: Scene) -> None:
             )
 
 
+def check_formulation(scene: Scene) -> None:
+    if scene.formulation not in ("updated", "total"):
+        raise SceneError(
+            f'Scene: formulation = {shown(scene.formulation)} must be "updated" or "total"'
+        )
+    if scene.formulation == "updated":
+        return
+    for what, there, cure in (
+        (f"{len(scene.walls)} walls", scene.walls, "stand the body on a Ground"),
+        (f"{len(scene.clamps)} clamps", scene.clamps, "hold the body otherwise"),
+        (f"blend_time = {scene.blend_time:g}", scene.blend_time, "give the material a viscosity"),
+    ):
+        if there:
+            raise SceneError(
+                f'Scene: the formulation "total" has no grid for {what}; {cure}, or take "updated"'
+            )
+
+
 def check_stability(scene: Scene) -> None:
     for region in scene.body:
         limit = scene.material_of(region).largest_time_step(scene.grid.dx)

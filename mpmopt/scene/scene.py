@@ -5,11 +5,13 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass, field
+from typing import Literal
 
 from mpmopt.errors import SceneError
 from mpmopt.scene.checks import (
     ROUNDING,
     check_body,
+    check_formulation,
     check_mirror,
     check_size,
     check_stability,
@@ -32,6 +34,9 @@ from mpmopt.scene.parts import (
 from mpmopt.scene.serial import parsed, written
 from mpmopt.validation import MOST, count, number
 
+# Share of the limit of an isolated particle in the updated formulation.
+LAGRANGIAN_LIMIT = 0.8
+Formulation = Literal["updated", "total"]
 MOST_PASSES = 200  # of the design filter
 MOST_PER_CELL = 100  # particles, per direction
 MOST_PARTS = 1000  # of the body, and walls
@@ -72,6 +77,10 @@ class Scene(Checked):
         as in the paper.
     mirror : Mirror, optional
         Plane about which all of the scene is symmetric. Body, walls and ground are given whole.
+    formulation : {"updated", "total"}, optional
+        "updated" is MLS-MPM, the paper's: a grid is laid anew at every step, and solid may tear.
+        "total" is total Lagrangian: the body keeps the lattice of its reference configuration, at a
+        fraction of the cost, and stands on `ground`. Its parts do not feel each other.
     blend_time : float, optional
         Time tau in which particles lose what the transfer to the grid and back smooths away: they
         keep a share exp(-time_step / tau) of it in every step, so that damping is a rate and not
@@ -99,6 +108,7 @@ class Scene(Checked):
     filter_length: float = 0.0
     mirror: Mirror | None = None
     blend_time: float = 0.0
+    formulation: Formulation = "updated"
     transient: float = 0.0
     ground: tuple[Ground, ...] = ()
     clamps: tuple[Clamp, ...] = ()
@@ -172,6 +182,7 @@ class Scene(Checked):
         check_ground(self)
         check_clamps(self)
         check_mirror(self)
+        check_formulation(self)
         check_stability(self)
 
     def __str__(self) -> str:
@@ -227,10 +238,14 @@ class Scene(Checked):
 
     @property
     def largest_time_step(self) -> float:
-        """Stability limit of an isolated particle (`Material.largest_time_step`)."""
+        """Stability limit of an isolated particle (`Material.largest_time_step`).
+
+        A particle in the total Lagrangian formulation bears 0.9 of it: `LAGRANGIAN_LIMIT` counts.
+        """
         layers = [layer.stiffness / layer.thickness for layer in self.layers]
         layer = max(layers, default=0.0)
-        return min(each.largest_time_step(self.grid.dx, layer) for each in self.materials)
+        limit = min(each.largest_time_step(self.grid.dx, layer) for each in self.materials)
+        return LAGRANGIAN_LIMIT * limit if self.formulation == "total" else limit
 
     @property
     def layers(self) -> tuple[Layer, ...]:

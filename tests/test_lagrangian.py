@@ -1,0 +1,294 @@
+"""The total Lagrangian formulation: its step, its gradient, its laws."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from conftest import worst
+from walker import slanted_legs, walker
+
+from mpmopt import kernels
+from mpmopt.assess.verify import complex_step_test
+from mpmopt.design.problem import Problem
+from mpmopt.errors import SceneError
+from mpmopt.kernels import lagrangian
+from mpmopt.scene import Actuator, Design, Grid, Material, Mirror, Scene, Solid, Wall
+from mpmopt.scene.ground import Ground
+from mpmopt.scene.particles import discretise
+from mpmopt.simulation.checkpoints import Checkpointing
+from mpmopt.simulation.lagrangian import LagrangianSimulation
+from mpmopt.simulation.simulation import Simulation
+
+C = 1 / 16
+
+
+def lattice_scene(**changes) -> Scene:
+    """A small walker with two actuators in the total Lagrangian formulation."""
+    scene = {
+        "grid": Grid(cells=(16, 16), dx=C),
+        "time_step": 4e-3,
+        "steps": 60,
+        "material": Material(void_density=1e-2, void_stiffness=1e-3, viscosity=0.05),
+        "gravity": (0.5, -10.0),
+        "ground": (
+            Ground(((0.0, 4 * C), (5 * C, 4 * C), (1.0, 3.7 * C)), friction=0.4, thickness=C),
+        ),
+        "formulation": "total",
+        "body": (
+            Design((3 * C, 4 * C), (7 * C, 6 * C)),
+            Actuator((3 * C, 6 * C), (4 * C, 7 * C), stress=((2.0, 0.5), (0.5, 1.0))),
+            Solid((4 * C, 6 * C), (6 * C, 7 * C)),
+            Actuator((6 * C, 6 * C), (7 * C, 7 * C), angular_frequency=50.0),
+        ),
+    }
+    return Scene(**{**scene, **changes})
+
+
+def material_of(simulation):
+    """Density and stiffness of particles that are all solid."""
+    return np.ones(len(simulation.position)), np.ones(len(simulation.position))
+
+
+def reference_step(simulation, nodes, n):
+    """One step as its equations say it, node by node; without ground."""
+    scene, lattice = simulation.scene, simulation.lattice
+    N, Gx, Gy = (each.toarray() for each in simulation._weights)
+    count = len(N)
+    x, v = nodes[:, :2], nodes[:, 2:]
+    f = np.zeros_like(x)
+    stiffness = kernels.ungrouped(simulation.data.stiffness, 1, count)[0]
+    mass = N.T @ kernels.ungrouped(simulation.data.mass, 1, count)[0]
+    la, mu, eta = (getattr(scene.material, name) for name in kernels.PARAMETERS)
+    for p in range(count):
+        F = np.stack([Gx[p] @ x, Gy[p] @ x], axis=1)
+        rate = np.stack([Gx[p] @ v, Gy[p] @ v], axis=1)
+        J = np.linalg.det(F)
+        if J >= lagrangian.LEAST_J:
+            log, slope = math.log(J), 1.0 / J
+        else:
+            off = J / lagrangian.LEAST_J - 1.0
+            log = math.log(lagrangian.LEAST_J) + off - off**2 / 2
+            slope = (1.0 - off) / lagrangian.LEAST_J
+        cofactor = np.array([[F[1, 1], -F[1, 0]], [-F[0, 1], F[0, 0]]])
+        S = eta * (F.T @ rate + rate.T @ F) / 2
+        P = stiffness[p] * (mu * F + (la * log - mu) * slope * cofactor + F @ S)
+        k = simulation.particles.actuator[p]
+        if k >= 0:
+            P = P + simulation.signal[n, k] * F @ np.array(scene.actuators[k].stress)
+        f -= lattice.volume * (np.outer(Gx[p], P[:, 0]) + np.outer(Gy[p], P[:, 1]))
+    new = nodes.copy()
+    there = mass > 0.0
+    dt = scene.time_step
+    new[there, 2:] += dt * (f[there] / mass[there, None] + np.array(scene.gravity))
+    new[:, :2] += dt * new[:, 2:]
+    return new
+
+
+@pytest.mark.parametrize("per_cell", [2, 3])
+def test_a_step_is_what_its_equations_say(rng, per_cell):
+    scene = lattice_scene(ground=(), particles_per_cell=per_cell)
+    particles = discretise(scene)
+    count = len(particles.position)
+    simulation = LagrangianSimulation(
+        scene, particles, *rng.uniform(0.2, 1.0, (2, count)), rng.uniform(-1.0, 1.0, (60, 2))
+    )
+    nodes = simulation.start.copy()
+    nodes[:, :2] += 1.5 * C * rng.uniform(-1.0, 1.0, (len(nodes), 2))
+    nodes[:, 2:] = rng.standard_normal((len(nodes), 2))
+    nodes[simulation.lattice.mass == 0.0, 2:] = 0.0
+    states, pushes = np.zeros((2, *nodes.shape)), np.zeros((1, len(nodes)))
+    states[0] = nodes  # solid and void alike
+    lagrangian.advance_lattice(states, pushes, 0, 1, simulation.lattice, simulation.signal)
+    expected = reference_step(simulation, nodes, 0)
+    assert np.abs(states[1] - expected).max() <= 1e-13 * np.abs(expected).max()
+    F = kernels.parts(simulation.particle_state(nodes)).deformation
+    J = F[0, 0] * F[1, 1] - F[0, 1] * F[1, 0]
+    assert J.min() < lagrangian.LEAST_J < 1.0 < J.max()  # on both sides of the continuation
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"ground": (Ground(((0.0, 4 * C), (1.0, 4 * C)), friction="stick", thickness=C),)},
+        {"particles_per_cell": 3, "time_step": 2e-3},
+        {"transient": 0.1},
+        {"material": Material(void_density=1e-2)},
+    ],
+)
+def test_the_gradient_is_exact_in_contact(rng, changes):
+    problem = Problem(lattice_scene(**changes), 2.0, halvings=0, limits=None)
+    designed = int(problem.particles.designed.sum())
+    x = problem.join(rng.uniform(-0.8, 0.8, designed), 0.9, -0.3, -0.5)
+    assert worst(complex_step_test(problem, x)) <= 1e-12
+
+
+def test_the_gradient_is_the_same_for_all_checkpoints(rng):
+    scene = lattice_scene()
+    x = rng.uniform(-0.8, 0.8, Problem(scene).size)
+    whole = Problem(scene).value_and_gradient(x)
+    for every in (7, "all", 60):
+        for store in ("memory", "disk"):
+            value, gradient = Problem(
+                scene, checkpointing=Checkpointing(every=every, store=store)
+            ).value_and_gradient(x)
+            assert value == whole[0]
+            assert np.array_equal(gradient, whole[1])
+
+
+def channel(mirror):
+    """A block between two grounds, whole or half of it."""
+    body = (
+        Design((3 * C, 4 * C), (5 * C, 8 * C)),
+        Actuator((5 * C, 4 * C), (7 * C, 8 * C)),
+    )
+    walls = (
+        Ground(((0.0, 4 * C), (1.0, 4 * C)), friction=0.4, thickness=C),
+        Ground(((1.0, 8 * C), (0.0, 8 * C)), friction=0.4, thickness=C),
+    )
+    return lattice_scene(
+        body=body, ground=walls, gravity=(0.0, 0.0), mirror=Mirror("y", 6 * C) if mirror else None
+    )
+
+
+def test_half_a_symmetric_body_is_the_same_solution_and_has_the_same_gradient(rng):
+    half, whole = Problem(channel(True), 2.0), Problem(channel(False), 2.0)
+    x = half.join(rng.uniform(-0.5, 0.5, int(half.particles.designed.sum())), 0.9, -0.3, -0.5)
+    value, gradient = half.value_and_gradient(x)
+    y = whole.transfer(half, x)
+    position, own = (p.particles.position[p.particles.designed] for p in (whole, half))
+    folded = np.where(position[:, 1:] > 6 * C, [0.0, 12 * C], 0.0)
+    folded = np.abs(folded - position)
+    image = np.array([np.abs(own - each).sum(axis=1).argmin() for each in folded])
+    y[: len(image)] = x[image]
+    expected, by_y = whole.value_and_gradient(y)
+    assert value == pytest.approx(expected, rel=1e-12)
+    summed = np.zeros(len(own))
+    np.add.at(summed, image, by_y[: len(image)])
+    assert gradient[: len(own)] == pytest.approx(summed, rel=1e-9, abs=1e-13)
+    assert worst(complex_step_test(half, x)) <= 1e-12
+
+
+def free_block(**changes):
+    scene = lattice_scene(
+        ground=(), gravity=(0.0, 0.0),
+        body=(Solid((4 * C, 4 * C), (9 * C, 7 * C)), Actuator((9 * C, 4 * C), (12 * C, 7 * C))),
+        **changes,
+    )  # fmt: skip
+    particles = discretise(scene)
+    t = scene.time_step * np.arange(scene.steps)
+    return LagrangianSimulation(scene, particles, *material_of(particles), np.sin(20 * t)[:, None])
+
+
+def test_a_free_body_keeps_its_momenta():
+    simulation = free_block()
+    states = np.zeros((61, *simulation.start.shape))
+    states[0] = simulation.start
+    states[0, :, 2] = 0.3 + 2.0 * (states[0, :, 1] - 0.3)
+    lattice = simulation.lattice
+    lagrangian.advance_lattice(
+        states, np.zeros((60, simulation.nodes)), 0, 60, lattice, simulation.signal
+    )
+    x, v, m = states[..., :2], states[..., 2:], lattice.mass
+    linear = np.einsum("m,smk->sk", m, v)
+    before = x - simulation.scene.time_step * v  # positions that the velocities were found at
+    angular = np.einsum("m,sm->s", m, before[..., 0] * v[..., 1] - before[..., 1] * v[..., 0])
+    assert np.abs(linear - linear[0]).max() <= 1e-13 * np.abs(linear[0]).max()
+    assert np.abs(angular - angular[0]).max() <= 1e-12 * np.abs(angular[0])
+    assert np.abs(v - v[0]).max() > 0.1
+
+
+def test_void_may_invert_and_the_gradient_stays_exact(rng):
+    # The end of a block of void is thrown through the rest.
+    c = C
+    scene = lattice_scene(
+        ground=(), gravity=(0.0, 0.0), material=Material(void_density=1e-2, void_stiffness=1e-4),
+        time_step=2e-3, steps=60,
+        body=(
+            Design((3 * c, 4 * c), (5 * c, 7 * c)),
+            Actuator((5 * c, 4 * c), (7 * c, 7 * c), stress=((4.9, 0.0), (0.0, 0.0))),
+        ),
+    )  # fmt: skip
+    problem = Problem(scene, 8.0, halvings=0, limits=None)
+    x = problem.join(rng.uniform(-1.0, -0.8, int(problem.particles.designed.sum())), 1.0, 0.9, 0.0)
+    simulation = problem.simulation(x)
+    simulation.start[:, 2] = 3.0 * (simulation.start[:, 0] < 3.6 * c)
+    F = kernels.parts(simulation.run(range(0, 61, 5))).deformation
+    J = F[:, 0, 0] * F[:, 1, 1] - F[:, 0, 1] * F[:, 1, 0]
+    assert J.min() < lagrangian.LEAST_J
+    terminal = rng.standard_normal(simulation.initial.shape)
+    terminal[4:8] = 0.0
+    with simulation.checkpoints(Checkpointing()) as checkpoints:
+        gradient = simulation.forward(checkpoints).reverse({60: terminal})
+    direction = rng.standard_normal(simulation.start.shape)
+    moved = problem.simulation(x + 0j)
+    moved.start[:] = simulation.start + 1e-30j * direction
+    found = (terminal * moved.run()).sum().imag / 1e-30
+    assert found == pytest.approx((gradient.state * direction).sum(), rel=1e-10)
+
+
+def test_an_isolated_cell_is_stable_up_to_the_limit_and_not_far_beyond():
+    scene = lattice_scene(
+        body=(Solid((4 * C, 4 * C), (5 * C, 5 * C)), Actuator((5 * C, 4 * C), (6 * C, 5 * C))),
+        ground=(), gravity=(0.0, 0.0), material=Material(), time_step=1e-3, steps=400,
+    )  # fmt: skip
+    particles = discretise(scene)
+    particles = particles.subset(particles.position[:, 0] < 5 * C)
+
+    def grows(share):
+        simulation = LagrangianSimulation(
+            scene, particles, *material_of(particles), np.zeros((400, 1))
+        )
+        simulation.lattice = simulation.lattice._replace(dt=share * scene.largest_time_step)
+        rough = np.random.default_rng(1).standard_normal((simulation.nodes, 2))
+        simulation.start[:, :2] += 1e-6 * C * rough
+        states = np.zeros((401, *simulation.start.shape))
+        states[0] = simulation.start
+        with np.errstate(all="ignore"):
+            _, failed = lagrangian.advance_lattice(
+                states, np.zeros((400, simulation.nodes)), 0, 400, simulation.lattice,
+                simulation.signal,
+            )  # fmt: skip
+        return failed >= 0 or not np.abs(states[-1] - simulation.start).max() < 1e-2 * C
+
+    assert not grows(0.99)
+    assert grows(1.5)
+
+
+def test_both_formulations_walk_alike():
+    scene = dataclasses.replace(
+        walker(64, 8e-4), walls=(), steps=1250, material=Material(viscosity=0.02),
+        ground=(Ground(((0.0, 4 / 64), (1.0, 4 / 64)), friction=0.5),),
+    )  # fmt: skip
+    particles = discretise(scene)
+    there = ~particles.designed
+    there[particles.designed] = slanted_legs(particles.position[particles.designed])
+    particles = particles.subset(there)
+    t = scene.time_step * np.arange(scene.steps)
+    signal = (np.sin(30.0 * t - 0.3 * np.pi) - 0.5)[:, None]
+    gone = []
+    for kind in (Simulation, LagrangianSimulation):
+        simulation = kind(scene, particles, *material_of(particles), signal)
+        ends = simulation.run([0, 1250])[:, 0, ~particles.designed].mean(axis=1)
+        gone.append(ends[1] - ends[0])
+    assert gone[0] > 0.04
+    assert gone[1] == pytest.approx(gone[0], rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"walls": (Wall("y", 4 * C),), "ground": ()}, "no grid for 1 walls; stand the body"),
+        ({"blend_time": 1e-2}, "no grid for blend_time = 0.01; give the material"),
+        ({"formulation": "eulerian"}, 'must be "updated" or "total"'),
+    ],
+)
+def test_what_the_formulation_cannot_do_is_said_with_the_cure(changes, says):
+    with pytest.raises(SceneError, match=says):
+        lattice_scene(**changes)
+
+
+def test_the_formulation_travels_as_json():
+    scene = lattice_scene()
+    assert Scene.from_json(scene.to_json()) == scene
