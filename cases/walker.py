@@ -19,6 +19,8 @@ from mpmopt.app.script import main
 from mpmopt.optimisation.presets import IN_ONE_PIECE, gait, paper_preset
 from mpmopt.scene import Actuator, Design, Grid, Ground, Material, Scene, Solid, Wall
 
+AHEAD = 8 / 64  # of the paper's body is the one on ground
+
 
 def walker(cells: int, time_step: float, particles_per_cell: int = 2) -> Scene:
     """The paper's walker on `cells` x `cells` cells of the unit square, for one second."""
@@ -39,17 +41,30 @@ def walker(cells: int, time_step: float, particles_per_cell: int = 2) -> Scene:
     )
 
 
-def walker_on_ground(cells: int, time_step: float, seconds: float) -> Scene:
-    """The same body on ground with a layer, of which all but the first second counts."""
+def walker_on_ground(cells: int, time_step: float, periods: int) -> Scene:
+    """The same body on ground with a layer, of which periods after the first second count.
+
+    It has more room, behind it too.
+    """
+    scene = walker(cells, time_step)
+    omega = scene.actuators[0].angular_frequency
     return replace(
-        walker(cells, time_step),
+        scene,
+        grid=Grid(cells=(3 * cells // 2, cells), dx=1 / cells),
+        body=tuple(
+            replace(part, lower=_ahead(part.lower), upper=_ahead(part.upper)) for part in scene.body
+        ),
         walls=(),
         ground=(Ground.floor(3 / 64, friction=0.5, thickness=1 / 64),),
         material=Material(viscosity=0.02),
-        steps=round(seconds / time_step),
+        steps=round((1.0 + periods * 2.0 * np.pi / omega) / time_step),
         transient=1.0,
-        filter_length=1 / 64,
+        filter_length=1.5 / 64,
     )
+
+
+def _ahead(point: tuple[float, float]) -> tuple[float, float]:
+    return point[0] + AHEAD, point[1]
 
 
 def slanted_legs(positions: np.ndarray) -> np.ndarray:
@@ -60,9 +75,18 @@ def slanted_legs(positions: np.ndarray) -> np.ndarray:
     return np.any([abs(x + foot - top * c) <= 1.25 * c for top in (7, 13, 19)], axis=0)
 
 
+def slanted_legs_on_ground(positions: np.ndarray) -> np.ndarray:
+    """The same legs under the body where `walker_on_ground` has it."""
+    return slanted_legs(positions - (AHEAD, 0.0))
+
+
 CASES = {
-    "default": Case(walker_on_ground(64, 8e-4, 4.0), gait(8e-4, 25), slanted_legs, task=IN_ONE_PIECE),
-    "preview": Case(walker_on_ground(64, 8e-4, 3.0), gait(8e-4, 12), slanted_legs, task=IN_ONE_PIECE),
+    "default": Case(
+        walker_on_ground(64, 8e-4, 15), gait(8e-4, 25), slanted_legs_on_ground, task=IN_ONE_PIECE
+    ),
+    "preview": Case(
+        walker_on_ground(64, 8e-4, 10), gait(8e-4, 12), slanted_legs_on_ground, task=IN_ONE_PIECE
+    ),
     "paper": Case(walker(128, 2e-4), paper_preset(2e-4), slanted_legs),
 }
 
