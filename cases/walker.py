@@ -59,7 +59,7 @@ def walker_on_ground(cells: int, time_step: float, periods: int) -> Scene:
         material=Material(viscosity=0.02),
         steps=round((1.0 + periods * 2.0 * np.pi / omega) / time_step),
         transient=1.0,
-        filter_length=1.5 / 64,
+        filter_length=1 / 64,
     )
 
 
