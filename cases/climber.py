@@ -3,7 +3,7 @@
     python cases/climber.py --preview --out DIR
 
 It is not in the paper. It shows a scene of one's own: gravity along the shaft, nothing to stand
-on, several actuators.
+on but a bottom far below, several actuators.
 """
 
 import sys
@@ -12,25 +12,32 @@ import numpy as np
 
 from mpmopt.app.case import Case
 from mpmopt.app.script import main
-from mpmopt.optimisation.presets import continuation
-from mpmopt.scene import Actuator, Design, Grid, Mirror, Scene, Wall
+from mpmopt.optimisation.presets import IN_ONE_PIECE, gait
+from mpmopt.scene import Actuator, Design, Grid, Ground, Material, Mirror, Scene
 
 
-def climber(cells: int, time_step: float) -> Scene:
-    """The climber on `cells` x `cells` cells of the unit square, for one second."""
+def climber(cells: int, time_step: float, periods: int) -> Scene:
+    """The climber on `cells` x `cells` cells; periods of its actuators after a second count."""
     c = 1 / 64
-    left, right, low, high = 26 * c, 38 * c, 18 * c, 42 * c  # of the body, which fills the shaft
+    left, right, low, high = 26 * c, 38 * c, 18 * c, 42 * c  # of the body
+    # The shaft's layers are a cell thick and squeeze the body a little, so that it holds at first.
+    walls, bottom = (25.3 * c, 38.7 * c), 4 * c
+    shaft = ((walls[0], 1.0), (walls[0], bottom), (walls[1], bottom), (walls[1], 1.0))
+    actuators = tuple(Actuator((30 * c, y * c), (34 * c, (y + 6) * c)) for y in (21, 27, 33))
+    period = 2.0 * np.pi / actuators[0].angular_frequency
     return Scene(
         grid=Grid(cells=(cells, cells), dx=1 / cells),
         time_step=time_step,
-        steps=round(1.0 / time_step),
+        steps=round((1.0 + periods * period) / time_step),
+        transient=1.0,
         gravity=(0.0, -1.0),
         direction=(0.0, 1.0),
-        walls=(Wall("x", left), Wall("x", right, "above")),
+        ground=(Ground(shaft, friction=1.0, thickness=c),),
+        material=Material(viscosity=0.02),
         body=(
             Design((left, low), (right, 21 * c)),
             Design((left, 21 * c), (30 * c, 39 * c)),
-            *(Actuator((30 * c, y * c), (34 * c, (y + 6) * c)) for y in (21, 27, 33)),
+            *actuators,
             Design((34 * c, 21 * c), (right, 39 * c)),
             Design((left, 39 * c), (right, high)),
         ),
@@ -51,8 +58,8 @@ def slanted_legs(positions: np.ndarray) -> np.ndarray:
 START = {"phi": 0.0, "a": 1.0, "theta": (0.7, 0.2, -0.3), "b": -0.5}
 
 CASES = {
-    "default": Case(climber(128, 5e-4), continuation(5e-4), slanted_legs, START),
-    "preview": Case(climber(64, 8e-4), continuation(8e-4), slanted_legs, START),
+    "default": Case(climber(64, 8e-4, 15), gait(8e-4, 25), slanted_legs, START, IN_ONE_PIECE),
+    "preview": Case(climber(64, 8e-4, 10), gait(8e-4, 12), slanted_legs, START, IN_ONE_PIECE),
 }
 
 if __name__ == "__main__":

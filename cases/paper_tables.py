@@ -89,7 +89,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument(
         "--out", type=Path, required=True, metavar="DIR", help="folder of both runs"
     )
-    parser.add_argument("--setting", choices=SETTINGS, default="default", help="of both cases")
+    parser.add_argument("--setting", choices=SETTINGS, default="paper", help="of both cases")
     arguments = parser.parse_args(argv)
     try:
         summaries = {

@@ -18,8 +18,10 @@ from mpmopt.app.case import START, Case, ProgressBar, resume, run
 from mpmopt.app.script import main
 from mpmopt.assess.threshold import pieces
 from mpmopt.design.problem import Problem
+from mpmopt.design.task import Task
 from mpmopt.errors import DesignError, RunFileError, StorageError
 from mpmopt.optimisation.loop import optimise
+from mpmopt.optimisation.presets import IN_ONE_PIECE
 from mpmopt.optimisation.settings import Settings, Stage
 from mpmopt.results import runfile
 from mpmopt.view import plot
@@ -86,15 +88,15 @@ def test_a_small_crawler_crawls_even_without_its_void(tmp_path):
 @pytest.mark.case
 def test_a_small_climber_climbs_even_without_its_void(tmp_path):
     settings = dataclasses.replace(SMALL.settings, least_iterations=10, most_iterations=10)
-    case = Case(climber.climber(64, 8e-4), settings, climber.slanted_legs, climber.START)
+    case = Case(climber.climber(64, 8e-4, 4), settings, climber.slanted_legs, climber.START)
     summary = run(case, tmp_path)
     assert summary["start"] <= 30 / 64  # where it is put: it sags
-    best_reference = max(summary["reference"], summary["baseline"])
-    assert summary["optimised"] - best_reference >= 0.065
-    assert summary["post_processed"] - best_reference >= 0.06
+    assert summary["optimised"] - summary["reference"] >= 0.02
+    assert summary["post_processed"] - summary["reference"] >= 0.015
+    assert summary["disconnected_particles"] == 0
     assert summary["failed_evaluations"] == 0
     assert np.shape(summary["theta"]) == (3,)  # each core kept a phase of its own
-    assert np.ptp(summary["theta"]) >= 0.5
+    assert np.ptp(summary["theta"]) >= 0.3
 
 
 def test_the_folder_holds_run_summary_and_pictures(folder):
@@ -224,10 +226,16 @@ def test_progress_becomes_log_lines_off_a_terminal(capsys):
 
 def test_the_walkers_settings_are_those_of_the_design():
     preview, default, paper = (CASES[name] for name in ("preview", "default", "paper"))
-    assert (preview.scene.grid.cells[0], preview.scene.time_step) == (64, 8e-4)
-    assert (default.scene.grid.cells[0], default.scene.time_step) == (128, 5e-4)
-    fine = [s for s in default.settings.stages if s.coarsening == 1]
-    assert {(s.void_density, s.void_stiffness, s.time_step) for s in fine} == {(1e-2, 1e-3, 5e-4)}
+    for case in (preview, default):
+        assert (case.scene.grid.dx, case.scene.time_step) == (1 / 64, 8e-4)
+        assert not case.scene.walls
+        assert case.scene.ground
+        assert case.task == IN_ONE_PIECE
+        floors = {(s.void_density, s.void_stiffness) for s in case.settings.stages}
+        assert floors == {(1e-2, 1e-3)}
+    assert default.scene.steps > preview.scene.steps
+    assert not paper.scene.ground
+    assert (paper.scene, paper.task) == (walker(128, 2e-4), Task())
     assert (paper.scene.grid.cells[0], paper.scene.steps) == (128, 5000)
     assert {(s.void_density, s.void_stiffness) for s in paper.settings.stages} == {(1e-3, 1e-3)}
     assert [s.beta for s in paper.settings.stages] == [0.5, 1.0, 2.0, 4.0, 8.0, 16.0]

@@ -268,18 +268,13 @@ def test_the_presets_are_what_they_say():
     assert [stage.void_cutoff > 0.0 for stage in sharp.stages] == late
     assert (sharp.adapt_move_limit, sharp.sharpen_asymptotes, sharp.best_first) == 3 * (True,)
 
-    fine = presets.coarse_to_fine(2e-3, 1e-3)
-    coarse, rest = fine.stages[:5], fine.stages[5:]
-    assert [stage.beta for stage in coarse] == [0.5, 1.0, 2.0, 4.0, 8.0]
-    assert {(stage.coarsening, stage.time_step, stage.refined) for stage in coarse} == {
-        (2, 2e-3, False)
-    }
-    assert [stage.solid for stage in coarse] == 4 * [False] + [True]
-    assert [stage.beta for stage in rest] == [8.0, *4 * [16.0], *3 * [32.0]]
-    assert {(stage.coarsening, stage.time_step, stage.refined, stage.solid) for stage in rest} == {
-        (1, 1e-3, True, True)
-    }
-    assert fine.tolerance == 0.0
+    gait = presets.gait(1e-3, 12)
+    assert [stage.beta for stage in gait.stages] == [1.0, 2.0, 4.0, 8.0, 16.0, 32.0]
+    assert [stage.solid for stage in gait.stages] == 3 * [False] + 3 * [True]
+    assert [stage.void_cutoff > 0.0 for stage in gait.stages] == 3 * [False] + 3 * [True]
+    assert [stage.refined for stage in gait.stages] == 4 * [False] + 2 * [True]
+    assert {(stage.move_limit, stage.time_step) for stage in gait.stages} == {(0.1, 1e-3)}
+    assert gait.most_iterations == 12
 
     paper = presets.paper_preset(1e-3)
     assert [stage.beta for stage in paper.stages] == [0.5, 1.0, 2.0, 4.0, 8.0, 16.0]
