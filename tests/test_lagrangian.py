@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -212,7 +213,7 @@ def test_void_may_invert_and_the_gradient_stays_exact(rng):
     )  # fmt: skip
     problem = Problem(scene, 8.0, halvings=0, limits=None)
     x = problem.join(rng.uniform(-1.0, -0.8, int(problem.particles.designed.sum())), 1.0, 0.9, 0.0)
-    simulation = problem.simulation(x)
+    simulation: Any = problem.simulation(x)
     simulation.start[:, 2] = 3.0 * (simulation.start[:, 0] < 3.6 * c)
     F = kernels.parts(simulation.run(range(0, 61, 5))).deformation
     J = F[:, 0, 0] * F[:, 1, 1] - F[:, 0, 1] * F[:, 1, 0]
@@ -222,7 +223,7 @@ def test_void_may_invert_and_the_gradient_stays_exact(rng):
     with simulation.checkpoints(Checkpointing()) as checkpoints:
         gradient = simulation.forward(checkpoints).reverse({60: terminal})
     direction = rng.standard_normal(simulation.start.shape)
-    moved = problem.simulation(x + 0j)
+    moved: Any = problem.simulation(x + 0j)
     moved.start[:] = simulation.start + 1e-30j * direction
     found = (terminal * moved.run()).sum().imag / 1e-30
     assert found == pytest.approx((gradient.state * direction).sum(), rel=1e-10)
@@ -268,7 +269,8 @@ def test_both_formulations_walk_alike():
     t = scene.time_step * np.arange(scene.steps)
     signal = (np.sin(30.0 * t - 0.3 * np.pi) - 0.5)[:, None]
     gone = []
-    for kind in (Simulation, LagrangianSimulation):
+    kinds: tuple[type[Simulation], ...] = Simulation, LagrangianSimulation
+    for kind in kinds:
         simulation = kind(scene, particles, *material_of(particles), signal)
         ends = simulation.run([0, 1250])[:, 0, ~particles.designed].mean(axis=1)
         gone.append(ends[1] - ends[0])

@@ -10,7 +10,6 @@ from silicone import silicone_walker, slanted_legs
 
 from mpmopt.assess.threshold import solid_body
 from mpmopt.assess.verify import DOT_TOLERANCE, complex_step_test, kernel_mismatches
-from mpmopt.design.objective import Objective
 from mpmopt.design.problem import Problem, Variables
 from mpmopt.errors import SceneError
 from mpmopt.kernels import PARAMETERS, ungrouped
