@@ -99,7 +99,7 @@ def displacement(
         for value in (strength * START["a"], START["theta"], strength * START["b"])
     )
     keep = legs(particles.position[particles.designed])
-    simulation, _ = solid_body(scene, keep, Variables(np.zeros(0), a, theta, b))
+    simulation = solid_body(scene, keep, Variables(np.zeros(0), a, theta, b))
     row: dict[str, Any] = {
         "choice": choice.name, "cells": cells, "step": scene.time_step,
         "displacement": np.nan, "stretch": np.nan, "failure": "",
@@ -160,7 +160,7 @@ def radii(
 ) -> dict[float, float]:
     """Largest changes along a direction up to which the slope predicts L within these shares."""
     found = dict.fromkeys(SHARES, 0.0)
-    open_ = SHARES
+    open_: tuple[float, ...] = SHARES
     for step in gradients.STEPS[::-1]:
         off = abs(problem.value(x + step * direction) - value - step * slope)
         # Below 1e-14 a change drowns in rounding.

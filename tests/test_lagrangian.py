@@ -269,7 +269,7 @@ def test_both_formulations_walk_alike():
     t = scene.time_step * np.arange(scene.steps)
     signal = (np.sin(30.0 * t - 0.3 * np.pi) - 0.5)[:, None]
     gone = []
-    kinds: tuple[type[Simulation], ...] = Simulation, LagrangianSimulation
+    kinds: tuple[Any, ...] = Simulation, LagrangianSimulation
     for kind in kinds:
         simulation = kind(scene, particles, *material_of(particles), signal)
         ends = simulation.run([0, 1250])[:, 0, ~particles.designed].mean(axis=1)

@@ -26,7 +26,7 @@ def pushed(scene, seconds=PUSHED):
     problem = Problem(scene)
     variables = problem.split(problem.join(1.0, 0.0, 0.0, 0.0))
     keep = np.ones(int(problem.particles.designed.sum()), dtype=bool)
-    simulation, _ = solid_body(scene, keep, variables)
+    simulation = solid_body(scene, keep, variables)
     position = parts(simulation.run([scene.steps])[-1]).position
     gap, _ = scene.ground[0].distance(position)
     return gap, position

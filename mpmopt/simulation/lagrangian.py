@@ -77,9 +77,9 @@ class LagrangianSimulation(Simulation):
             pattern=lagrangian.pattern(per_cell, dx),
             constants=np.array(constants),
             stiffness=laid_out(of_particles(self.data.stiffness)),
-            filled=there.reshape(columns * rows, -1).any(axis=1),
+            filled=np.any(there.reshape(columns * rows, -1), axis=1),
             actuated=actuated,
-            active=actuated.any(axis=(0, 2)) if len(actuated) else np.zeros(shape[0], bool),
+            active=np.any(actuated.reshape(len(actuated), *shape), axis=(0, 2)),
             actuation_stress=self.data.actuation_stress,
             mass=self._folded(mass, axis, int(rows)),
             ground=self.parameters.ground,
@@ -292,7 +292,7 @@ class LagrangianForward(Forward):
         instants: Collection[int],
     ) -> None:
         self._simulation: Any = simulation
-        self._checkpoints, self._memory = checkpoints, memory
+        self._checkpoints, self._shared = checkpoints, memory
         self._reversed = False
         memory.runs += 1
         self._run = memory.runs
@@ -324,7 +324,7 @@ class LagrangianForward(Forward):
         steps, shape = simulation.steps, simulation.initial.shape
         if self._reversed:
             raise DesignError("this run was gone back through already; run forward again")
-        if self._memory.runs != self._run:
+        if self._shared.runs != self._run:
             raise DesignError("another run took this one's memory; give each run its own")
         for step, terminal in terminal_adjoints.items():
             if not 0 <= step <= steps or np.shape(terminal) != shape:
