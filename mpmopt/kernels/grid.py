@@ -102,7 +102,7 @@ def grid_update_adjoint(grid, window, parameters, clamps, velocity_bar, node_bar
             u, v = grid[0, node, 0] * per_m, grid[0, node, 1] * per_m
             free_u, free_v = held_u, held_v = free_velocity(grid, node, per_m, parameters)
             push = parameters.dt * grid[0, node, 3] * per_m
-            if push > 0.0:
+            if push > 0.0 and len(parameters.walls) > 0:
                 contact = contact_at(parameters, i0 + a, j0 + b)
                 held_u, held_v = resistance(free_u, free_v, push, contact)
             u_bar, v_bar = wall_adjoint(

@@ -55,7 +55,7 @@ def friction(v, c, creeping):
     """
     s = v if v.real > 0.0 else -v
     if s.real >= (creeping + c).real:
-        return v - c * v / s
+        return v - c if v.real > 0.0 else v + c
     root = np.sqrt(creeping * creeping + 4.0 * c * (creeping + c - s))
     return v * (2.0 * creeping) / (creeping + 2.0 * c + root)
 
