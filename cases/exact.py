@@ -173,7 +173,7 @@ def manufactured_error(n, amplitude, courant=0.2, per_cell=2):
         mirror(grid.reshape(side, side, 4), 0, n)
         mirror(grid.reshape(side, side, 4).transpose(1, 0, 2), 1, n)
         for column in range(side):
-            kernels.grid_update(nodes, window, parameters, velocity, column)
+            kernels.grid_update(nodes, window, parameters, parameters.clamps[0], velocity, column)
         kernels.taylor(velocity[0], window, window, velocity_cells)
         kernels.g2p(old, new, parameters, tile, velocity_cells, *every)
         old, new = new, old

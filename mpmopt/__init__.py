@@ -15,6 +15,8 @@ _HOMES = {
     "Solid": "mpmopt.scene",
     "Actuator": "mpmopt.scene",
     "Wall": "mpmopt.scene",
+    "Ground": "mpmopt.scene",
+    "Clamp": "mpmopt.scene",
     "Mirror": "mpmopt.scene",
     "SILICONES": "mpmopt.scene",
     "Problem": "mpmopt.design.problem",
@@ -52,8 +54,10 @@ if TYPE_CHECKING:
     from mpmopt.results.runfile import read_run as read_run
     from mpmopt.scene import SILICONES as SILICONES
     from mpmopt.scene import Actuator as Actuator
+    from mpmopt.scene import Clamp as Clamp
     from mpmopt.scene import Design as Design
     from mpmopt.scene import Grid as Grid
+    from mpmopt.scene import Ground as Ground
     from mpmopt.scene import Material as Material
     from mpmopt.scene import Mirror as Mirror
     from mpmopt.scene import Scene as Scene

@@ -160,6 +160,42 @@ def refine(path: Path) -> int:
     return 0
 
 
+def forces(path: Path, out: Path | None, force: bool) -> int:
+    """Print what drives and bears a run's best design, without grey, and draw it over time."""
+    import numpy as np
+
+    from mpmopt.assess.forces import books
+    from mpmopt.assess.trajectory import post_processed
+    from mpmopt.io.files import make_folder, refuse_existing
+    from mpmopt.io.progress import Progress
+    from mpmopt.validation import digits
+    from mpmopt.view.plot import plot_forces
+
+    run = _read(path).run
+    picture = (out or path.parent) / "forces.png"
+    refuse_existing([picture] if out else (), force)
+    body = post_processed(run.problem(), run.result.x)
+    with Progress("steps", body.simulation.steps) as progress:
+        found = books(body.simulation, progress.step)
+    make_folder(picture.parent)
+    plot_forces(picture, body.name, found)
+    _, borne, _ = found.means(100)
+    sizes = np.hypot(*np.moveaxis(borne, -1, 0))
+    print(f"{'travel':<24} {digits(found.travel)}, of the centre of mass")
+    print(f"{'weight':<24} {digits(found.weight)}")
+    print(f"{'cost of transport':<24} {digits(found.cost_of_transport)}")
+    for name, values in found.work.items():
+        print(f"{'work of ' + name:<24} {digits(float(values[-1]))}")
+    share = float(np.abs(found.residual).max()) / (found.turnover or 1.0)
+    print(f"{'unexplained':<24} {share:.1g} of the energy that is turned over")
+    for k, name in enumerate(found.supports):
+        mean = ", ".join(digits(value) for value in borne[:, k].mean(axis=0))
+        peak = digits(float(sizes[:, k].max()))
+        print(f"{'force of ' + name:<24} mean ({mean}), at most {peak} over 1 % of the time")
+    print(picture)
+    return 0
+
+
 def cheapest(path: Path, tol: float, gradient_tol: float | None, seconds: float) -> int:
     """Print the cheapest discretisation that tells a run's best design as well as the finest."""
     from mpmopt.assess import discretisation
@@ -330,6 +366,18 @@ def _parser() -> argparse.ArgumentParser:
         "out/walker/run.h5",
     )
     command.set_defaults(do=refine)
+
+    command = add(
+        "forces",
+        "say what drives and bears its best design",
+        "Keep the books of the best design, without void: the work of actuators, viscosity,\n"
+        "ground, walls and numerics, the cost of transport (actuators' work over weight and\n"
+        "travel), and the forces of ground and walls. forces.png shows them over time.",
+        "out/walker/run.h5",
+        "out/walker/run.h5 --out pictures",
+    )
+    add_place(command, "DIR", "folder (default: the run's)")
+    command.set_defaults(do=forces)
 
     command = add(
         "cheapest",

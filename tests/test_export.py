@@ -332,7 +332,7 @@ def test_the_motion_is_read_back_by_vtk(tmp_path, mirror):
     export(problem, x, tmp_path, ["vtk"])
     times, frames = read_motion(tmp_path / "motion.vtkhdf")
     assert times == pytest.approx(np.arange(41) * scene.time_step)
-    simulation, _ = solid_body(scene, problem.gamma(x) >= 0.3, problem.split(x))
+    simulation = solid_body(scene, problem.gamma(x) >= 0.3, problem.split(x))
     states = simulation.run(range(41))
     count = states.shape[2]
     spacing = scene.grid.dx / scene.particles_per_cell

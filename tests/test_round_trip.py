@@ -147,7 +147,7 @@ def test_every_field_of_a_scene_comes_back_from_its_text():
         field.name for field in dataclasses.fields(Scene)
         if same(getattr(scene, field.name), field.default)
     }  # fmt: skip
-    assert defaults == {"mirror"}
+    assert defaults == {"mirror", "ground", "clamps"}
     assert same(Scene.from_json(scene.to_json()), scene)
     half = small_scene(
         body=small_scene().body[2:3], walls=(), gravity=(0.0, -1.0), direction=(0.0, 1.0),

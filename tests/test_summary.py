@@ -12,6 +12,7 @@ from mpmopt.app.case import Case
 from mpmopt.app.summary import summarise
 from mpmopt.assess import refinement, threshold
 from mpmopt.assess.refinement import Variant
+from mpmopt.design.objective import Objective
 from mpmopt.design.problem import Problem
 from mpmopt.design.task import DEFAULT_TASK
 from mpmopt.errors import SimulationError
@@ -249,7 +250,8 @@ def test_a_distance_after_a_transient_counts_from_there():
     # The body falls to one side at once.
     scene = small_scene(steps=6, transient=3 * 4e-3, gravity=(5.0, 0.0), walls=())
     keep, variables = np.ones(32, dtype=bool), PROBLEM.split(PROBLEM.join(1.0, 0.5, 0.0, 0.0))
-    simulation, objective = threshold.solid_body(scene, keep, variables)
+    simulation = threshold.solid_body(scene, keep, variables)
+    objective = Objective.of(scene, simulation.particles)
     states = simulation.run([3, 6])
     settled, end = (objective.centroid(state) for state in states)
     expected = objective.start + end - settled

@@ -6,6 +6,7 @@ import re
 import numpy as np
 import pytest
 from conftest import small_scene
+from exact import at_rest, solid_simulation
 
 from mpmopt import __main__ as commands
 from mpmopt.app.case import ProgressBar
@@ -16,7 +17,8 @@ from mpmopt.design.problem import Problem
 from mpmopt.optimisation.loop import optimise
 from mpmopt.optimisation.settings import Settings, Stage
 from mpmopt.results import runfile
-from mpmopt.scene import Actuator, Grid, Material
+from mpmopt.scene import Actuator, Grid, Ground, Material, Solid
+from mpmopt.scene.particles import discretise
 
 # What is a length; the rest has no unit.
 LENGTHS = ("objective", "post_processed", "refined", "projected_gradient")
@@ -52,6 +54,10 @@ def scaled(scene, length, mass, time):
         time_step=time * scene.time_step,
         body=tuple(region(part) for part in scene.body),
         walls=tuple(dataclasses.replace(w, position=length * w.position) for w in scene.walls),
+        ground=tuple(
+            dataclasses.replace(g, points=tuple((length * x, length * y) for x, y in g.points))
+            for g in scene.ground
+        ),
         material=solid(scene.material),
         gravity=tuple(length / time**2 * g for g in scene.gravity),
         filter_length=length * scene.filter_length,
@@ -187,3 +193,22 @@ def test_a_gain_that_is_rounding_is_none():
     assert threshold.beyond_rounding(small_scene(), -4e-19) == 0.0
     assert threshold.beyond_rounding(small_scene(), 4e-9) == 4e-9
     assert table({"gain": {"as designed": 0.0, "half the step": None}}).split("  ")[-1] == "-"
+
+
+@pytest.mark.parametrize("gravity", [(0.5, -10.0), (0.0, 0.0)])
+def test_what_a_layer_takes_from_its_scene_has_the_right_units(gravity):
+    ground = Ground.slope((5 / 16, 3.7 / 16), 3.0)
+    scene = small_scene(
+        walls=(), gravity=gravity, time_step=2e-3, ground=(ground,), body=(
+            Solid((3 / 16, 4 / 16), (9 / 16, 14 / 16)),
+        ),
+    )  # fmt: skip
+    ends = []
+    for units in ((1.0, 1.0, 1.0), (1e3, 1e-6, 1e2)):
+        other = scaled(scene, *units)
+        particles = discretise(other)
+        state = at_rest(particles)
+        state[2:4] = units[0] / units[2] * np.array([[0.3], [-0.5]])
+        state = solid_simulation(other, particles, state).run()
+        ends.append(state[:2] / units[0])
+    assert ends[1] == pytest.approx(ends[0], rel=1e-9)

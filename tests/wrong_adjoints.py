@@ -17,6 +17,7 @@ from mpmopt import kernels
 from mpmopt.assess import verify
 from mpmopt.design import actuation, chain, objective, problem
 from mpmopt.design.problem import Problem
+from mpmopt.scene import Ground
 from mpmopt.simulation import simulation
 
 # What is replaced in the kernels, by a name of the fault. Each stands in an adjoint kernel.
@@ -62,6 +63,16 @@ FAULTS = {
     ),
     "old deformation gradient": ("b00 + dt * (c00 * b00 + c10 * b10)", "b00"),
 }
+# In what Taylor's window does not have.
+GROUND_FAULTS = {
+    "friction through the normal force": (
+        "node_bar[0, node, 3] = push_bar * parameters.dt * per_m",
+        "node_bar[0, node, 3] = 0.0 * push_bar",
+    ),
+    "friction through the mass": ("-= push_bar * push * per_m", "-= 0.0 * push_bar"),
+    "slope of the layer": ("-b_bar * capacity / thickness, b_bar", "0.0 * b_bar, b_bar"),
+    "stiffness of the layer": ("stiffness * volume * capacity_bar)", "volume * capacity_bar)"),
+}
 WALL_FAULT = ("u_bar, v_bar = wall_adjoint(", "u_bar, v_bar = (lambda *args: args[-2:])(")
 
 
@@ -104,12 +115,15 @@ def verdicts(scene, x) -> dict[str, bool]:
 
 
 def main() -> None:
-    scene = small_scene(particles_per_cell=1, steps=8, blend_time=5e-3, transient=3 * 4e-3)
+    ground = (Ground.floor(3.9 / 16, friction=0.4, thickness=1 / 16),)
+    scene = small_scene(
+        particles_per_cell=1, steps=8, blend_time=5e-3, transient=3 * 4e-3, ground=ground
+    )
     p = Problem(scene)
     rng = np.random.default_rng(0)
     x = p.join(rng.uniform(-0.5, 0.5, 8), [0.6, 0.5], [-0.3, 0.2], [-0.5, 0.4])
     result = {"nothing": verdicts(scene, x)}
-    for name, fault in {**FAULTS, "wall forgotten": WALL_FAULT}.items():
+    for name, fault in {**FAULTS, **GROUND_FAULTS, "wall forgotten": WALL_FAULT}.items():
         with broken(*fault):
             result[name] = verdicts(scene, x)
 

@@ -12,6 +12,7 @@ from scipy.optimize import brentq
 from walker import slanted_legs
 
 from mpmopt.assess.threshold import solid_body
+from mpmopt.design.objective import Objective
 from mpmopt.design.problem import Variables
 from mpmopt.errors import SceneError, SimulationError
 from mpmopt.scene import Actuator, Grid, Material, Scene
@@ -104,7 +105,8 @@ def driven(strength: float, courant: float, bias: float = -1.0) -> dict[str, Any
         "stretch": np.nan, "error": "",
     }  # fmt: skip
     variables = Variables(np.zeros(0), np.ones(1), np.array([-0.3]), np.array([bias]))
-    simulation, objective = solid_body(scene, slanted_legs(positions), variables)
+    simulation = solid_body(scene, slanted_legs(positions), variables)
+    objective = Objective.of(scene, simulation.particles)
     try:
         states = simulation.run([*range(0, scene.steps, 10), scene.steps])
         row["distance"] = objective.centroid(states[-1]) - 16 / 64

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from mpmopt.assess.threshold import THRESHOLD, distance, solid_body
+from mpmopt.design.objective import Objective
 from mpmopt.design.problem import Problem
 from mpmopt.design.step_control import LIMITS
 from mpmopt.errors import SimulationError
@@ -70,7 +71,8 @@ def climb(
     )
     with suppress(SimulationError):
         row["gain_half_step"] = float(half.value(x)) - reference
-    simulation, objective = solid_body(problem.scene, best.gamma >= THRESHOLD, variables)
+    simulation = solid_body(problem.scene, best.gamma >= THRESHOLD, variables)
+    objective = Objective.of(problem.scene, simulation.particles)
     with suppress(SimulationError):
         states = simulation.run([*range(0, simulation.steps, 10), simulation.steps])
         row["gain_without_void"] = float(objective.centroid(states[-1])) - reference

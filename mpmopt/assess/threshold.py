@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from scipy.ndimage import label
 
 from mpmopt.design.actuation import signal
-from mpmopt.design.objective import Objective
 from mpmopt.design.problem import Problem, Variables
 from mpmopt.design.step_control import LIMITS, check_indicators
 from mpmopt.design.task import DEFAULT_TASK, Task
@@ -33,9 +32,7 @@ SOLID_LIMITS = LIMITS._replace(
 Baseline = Callable[[NDArray[np.float64]], NDArray[np.bool_]]
 
 
-def solid_body(
-    scene: Scene, keep: NDArray[np.bool_], variables: Variables
-) -> tuple[Simulation, Objective]:
+def solid_body(scene: Scene, keep: NDArray[np.bool_], variables: Variables) -> Simulation:
     """The body of which only some design particles are there, all of them solid.
 
     Parameters
@@ -63,14 +60,13 @@ def solid_body(
     there[particles.designed] = keep
     particles = particles.subset(there)
     ones = np.ones(there.sum())
-    simulation = Simulation(
+    return Simulation(
         scene,
         particles,
         density=of_solid(scene, particles, "density"),
         stiffness=ones,
         signal=signal(scene, variables.a, variables.theta, variables.b),
     )
-    return simulation, Objective.of(scene, particles)
 
 
 def distance(
@@ -95,7 +91,7 @@ def distance(
     SimulationError
         If the simulation fails, or goes beyond `SOLID_LIMITS`.
     """
-    simulation, _ = solid_body(scene, keep, variables)
+    simulation = solid_body(scene, keep, variables)
     end = simulation.watch(task.maximise.instants(scene))
     check_indicators(end.indicators, simulation, SOLID_LIMITS)
     return float(task.maximise.value(Outcome(simulation, np.array(keep, float), end.states)))

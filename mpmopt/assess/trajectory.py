@@ -82,7 +82,7 @@ def reference(problem: Problem, x: NDArray[np.float64]) -> Body:
 
 def solid(name: str, problem: Problem, x: NDArray[np.float64], keep: NDArray[np.bool_]) -> Body:
     """The body of which only the design particles in `keep` (D,) are there, all of them solid."""
-    simulation, _ = solid_body(problem.scene, keep, problem.split(x))
+    simulation = solid_body(problem.scene, keep, problem.split(x))
     gamma = np.ones(len(simulation.particles.position))
     return Body(name, simulation, gamma, problem.task.maximise, np.array(keep, float))
 

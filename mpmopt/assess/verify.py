@@ -401,14 +401,27 @@ class _Bench:
         dtype = np.result_type(*v.values()).type
         scratch, grid = self._scratch(dtype), self._grid(v, dtype)
         for column in range(self.window[2]):
-            kernels.grid_update(grid, self.window, self.parameters, scratch.velocity, column)
+            kernels.grid_update(
+                grid,
+                self.window,
+                self.parameters,
+                self.parameters.clamps[0],
+                scratch.velocity,
+                column,
+            )
         return {"velocity": scratch.velocity}
 
     def grid_update_adjoint(self, v: Arrays, w: Arrays) -> Arrays:
         scratch, grid = self._scratch(float), self._grid(v, float)
         for column in range(self.window[2]):
             kernels.grid_update_adjoint(
-                grid, self.window, self.parameters, w["velocity"], scratch.node_bar, column
+                grid,
+                self.window,
+                self.parameters,
+                self.parameters.clamps[0],
+                w["velocity"],
+                scratch.node_bar,
+                column,
             )
         node_bar = scratch.node_bar[:, self.mass_grid > 0.0]
         result = {"grid": node_bar[..., :3], "normal_force": node_bar[0, :, 3]}

@@ -59,10 +59,16 @@ from mpmopt.kernels.compiler import plain
 from mpmopt.kernels.contact import wall, wall_adjoint
 from mpmopt.kernels.deformation import deform, deform_adjoint
 from mpmopt.kernels.energy import energy, grips
-from mpmopt.kernels.grid import free_velocity, grid_update, grid_update_adjoint, mirror
+from mpmopt.kernels.grid import (
+    free_velocity,
+    grid_update,
+    grid_update_adjoint,
+    mirror,
+    update_nodes,
+)
 from mpmopt.kernels.indicators import SOLID, indicators
 from mpmopt.kernels.layer import press, press_adjoint
-from mpmopt.kernels.material import PARAMETERS, kirchhoff, wave_modulus
+from mpmopt.kernels.material import PARAMETERS, energy_density, kirchhoff, wave_modulus
 from mpmopt.kernels.overlap import closest
 from mpmopt.kernels.spline import (
     expand,
@@ -114,6 +120,7 @@ __all__ = [
     "deform",
     "deform_adjoint",
     "energy",
+    "energy_density",
     "expand",
     "expand_adjoint",
     "find_window",
@@ -145,6 +152,7 @@ __all__ = [
     "taylor",
     "taylor_adjoint",
     "ungrouped",
+    "update_nodes",
     "wall",
     "wall_adjoint",
     "wave_modulus",

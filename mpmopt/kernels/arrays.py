@@ -47,6 +47,7 @@ class Parameters(NamedTuple):
     gravity_y: float
     walls: NDArray[np.float64]  # (W, columns) as `contact` names them
     ground: Any  # `ground.Ground`
+    clamps: NDArray[np.float64]  # (steps, K, 6) lower and upper corner, and velocity of its nodes
     mirror_axis: int  # of the mirror plane's normal: 0 or 1; -1: no mirror
     mirror_node: int  # line of nodes that is the plane
     viscous: bool  # whether a material has a viscosity

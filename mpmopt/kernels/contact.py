@@ -1,4 +1,4 @@
-"""The law of contact: what becomes of the velocity of a node behind a wall.
+"""The law of contact: what becomes of the velocity of a node behind a wall, or in a clamp.
 
 A wall is a row of numbers, whose columns are named here; `scene.Wall.row` makes them. A law is
 `response` and `response_derivative`; `wall` and `wall_adjoint` apply it at all walls of a node.
@@ -73,6 +73,15 @@ def wall_adjoint(i, j, u, v, parameters, u_bar, v_bar):
             d00, d10 = uu * d00 + uv * d10, vu * d00 + vv * d10
             d01, d11 = uu * d01 + uv * d11, vu * d01 + vv * d11
     return d00 * u_bar + d10 * v_bar, d01 * u_bar + d11 * v_bar
+
+
+@jit
+def clamp_of(i, j, clamps, dx):
+    """The first of the clamps (K, 6) of a step that holds node (i, j), or -1."""
+    for k in range(len(clamps)):
+        if clamps[k, 0] <= i * dx <= clamps[k, 2] and clamps[k, 1] <= j * dx <= clamps[k, 3]:
+            return k
+    return -1
 
 
 @jit

@@ -1,7 +1,7 @@
 """Momentum and mass of nodes to their velocity."""
 
-from mpmopt.kernels.compiler import jit
-from mpmopt.kernels.contact import wall, wall_adjoint
+from mpmopt.kernels.compiler import jit, loop_jit
+from mpmopt.kernels.contact import clamp_of, wall, wall_adjoint
 from mpmopt.kernels.layer import contact_at, resistance, resistance_adjoint
 from mpmopt.kernels.simd import add, fused, load, nothing, store
 
@@ -55,8 +55,11 @@ def free_velocity(grid, node, per_m, parameters):
 
 
 @jit
-def grid_update(grid, window, parameters, velocity, a):
-    """Velocity of column a's nodes from momentum, gravity, ground and walls; zero without mass."""
+def grid_update(grid, window, parameters, clamps, velocity, a):
+    """Velocity of column a's nodes from momentum, gravity, ground, walls and a step's clamps.
+
+    It is zero where no mass is.
+    """
     i0, j0, _, nj = window
     for b in range(nj):
         node = a * nj + b
@@ -68,6 +71,9 @@ def grid_update(grid, window, parameters, velocity, a):
                 push = parameters.dt * grid[0, node, 3] / m
                 u, v = resistance(u, v, push, contact_at(parameters, i0 + a, j0 + b))
             u, v = wall(i0 + a, j0 + b, u, v, parameters)
+            clamp = clamp_of(i0 + a, j0 + b, clamps, parameters.dx)
+            if clamp >= 0:
+                u, v = clamps[clamp, 4] + 0.0 * m, clamps[clamp, 5] + 0.0 * m
         velocity[0, 2 * node], velocity[0, 2 * node + 1] = u, v
         if parameters.keep > 0.0:
             u = v = 0.0 * m
@@ -77,8 +83,15 @@ def grid_update(grid, window, parameters, velocity, a):
             velocity[1, 2 * node], velocity[1, 2 * node + 1] = u, v
 
 
+@loop_jit
+def update_nodes(grid, window, parameters, clamps, velocity):
+    """`grid_update` of all columns."""
+    for a in range(window[2]):
+        grid_update(grid, window, parameters, clamps, velocity, a)
+
+
 @jit
-def grid_update_adjoint(grid, window, parameters, velocity_bar, node_bar, a):
+def grid_update_adjoint(grid, window, parameters, clamps, velocity_bar, node_bar, a):
     """From velocity_bar of column a's nodes to their momentum_bar, mass_bar and f_N_bar."""
     i0, j0, _, nj = window
     for b in range(nj):
@@ -87,24 +100,31 @@ def grid_update_adjoint(grid, window, parameters, velocity_bar, node_bar, a):
         if m > parameters.mass_tolerance:
             per_m = 1.0 / m
             u, v = grid[0, node, 0] * per_m, grid[0, node, 1] * per_m
-            free_u, free_v = free_velocity(grid, node, per_m, parameters)
-            u_bar, v_bar = velocity_bar[0, 2 * node], velocity_bar[0, 2 * node + 1]
-            push = push_bar = 0.0 * m
-            if grid[0, node, 3] > 0.0:
-                push = parameters.dt * grid[0, node, 3] * per_m
+            free_u, free_v = held_u, held_v = free_velocity(grid, node, per_m, parameters)
+            push = parameters.dt * grid[0, node, 3] * per_m
+            if push > 0.0:
                 contact = contact_at(parameters, i0 + a, j0 + b)
-                held = resistance(free_u, free_v, push, contact)
-                u_bar, v_bar = wall_adjoint(i0 + a, j0 + b, *held, parameters, u_bar, v_bar)
+                held_u, held_v = resistance(free_u, free_v, push, contact)
+            u_bar, v_bar = wall_adjoint(
+                i0 + a,
+                j0 + b,
+                held_u,
+                held_v,
+                parameters,
+                velocity_bar[0, 2 * node],
+                velocity_bar[0, 2 * node + 1],
+            )
+            push_bar = 0.0 * m
+            if push > 0.0:
+                contact = contact_at(parameters, i0 + a, j0 + b)
                 u_bar, v_bar, push_bar = resistance_adjoint(
                     free_u, free_v, push, contact, u_bar, v_bar
-                )
-            else:
-                u_bar, v_bar = wall_adjoint(
-                    i0 + a, j0 + b, free_u, free_v, parameters, u_bar, v_bar
                 )
             momentum_bar(node_bar[0], node, u, v, per_m, u_bar, v_bar)
             node_bar[0, node, 2] -= push_bar * push * per_m
             node_bar[0, node, 3] = push_bar * parameters.dt * per_m
+            if clamp_of(i0 + a, j0 + b, clamps, parameters.dx) >= 0:
+                node_bar[0, node] = 0.0
             if parameters.keep > 0.0:
                 per_m = 1.0 / grid[1, node, 2]
                 u, v = grid[1, node, 0] * per_m, grid[1, node, 1] * per_m

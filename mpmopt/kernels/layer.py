@@ -21,8 +21,8 @@ from mpmopt.kernels.ground import (
     distance_adjoint,
     is_clear,
 )
-from mpmopt.kernels.simd import add_number, nothing, number, pack, set_number, total
-from mpmopt.kernels.spline import deposit, moments, slopes
+from mpmopt.kernels.simd import add_number, number, pack, set_number, total
+from mpmopt.kernels.spline import deposit_value, value_and_slopes
 
 
 @jit
@@ -117,43 +117,24 @@ def contact_at(parameters, i, j):
 
 
 @jit
-def pushed(state, data, parameters, tile, g, t, k):
-    """Impulse dt b n of the layers on particle k of a group, and b, into the tile.
-
-    Returns whether there is any.
-    """
-    ground, dt = parameters.ground, parameters.dt
-    x, y = number(state, at(g, POSITION), k), number(state, at(g, POSITION + 1), k)
-    share = number(data.stiffness, g, k) * number(data.volume, g, k)
-    px = py = force = 0.0 * x * share
-    for n in range(len(ground.layers)):
-        d, nx, ny, _ = distance(x, y, ground, n)
-        b = bearing(d, ground.layers[n, THICKNESS], ground.layers[n, STIFFNESS] * share)
-        px, py, force = px + dt * b * nx, py + dt * b * ny, force + b
-    set_number(tile.gathered, in_tile(t, VELOCITY_BAR), k, px)
-    set_number(tile.gathered, in_tile(t, VELOCITY_BAR + 1), k, py)
-    set_number(tile.gathered, in_tile(t, MASS_BAR), k, force)
-    return force.real > 0.0
-
-
-@jit
-def record_of_push(tile, t, k):
-    """What `pushed` left, as what it puts on nodes: (q_x, q_y, 0, f_N)."""
-    px = number(tile.gathered, in_tile(t, VELOCITY_BAR), k)
-    py = number(tile.gathered, in_tile(t, VELOCITY_BAR + 1), k)
-    return pack(px, py, 0.0 * px, number(tile.gathered, in_tile(t, MASS_BAR), k))
-
-
-@jit
 def press(state, data, parameters, tile, cells, first, last):
     """Layers to grid: their momentum and normal force, (q_x, q_y, 0, f_N), as moments of cells."""
-    none = nothing(cells)
+    ground, gathered = parameters.ground, tile.gathered
     for g in range(first, last):
         if not is_clear(state, parameters, g):
+            t = g - first
             for k in range(4):
-                if pushed(state, data, parameters, tile, g, g - first, k):
-                    deposit(cells, tile, g - first, k, record_of_push(tile, g - first, k),
-                            none, none)  # fmt: skip
+                x, y = number(state, at(g, POSITION), k), number(state, at(g, POSITION + 1), k)
+                share = number(data.stiffness, g, k) * number(data.volume, g, k)
+                for n in range(len(ground.layers)):
+                    d, nx, ny, _ = distance(x, y, ground, n)
+                    capacity = ground.layers[n, STIFFNESS] * share
+                    b = bearing(d, ground.layers[n, THICKNESS], capacity)
+                    if b.real > 0.0:
+                        store_push(
+                            gathered, t, k, parameters.dt * b * nx, parameters.dt * b * ny, b
+                        )
+                        deposit_value(cells, tile, t, k, load_push(gathered, t, k))
 
 
 @jit
@@ -162,35 +143,51 @@ def press_adjoint(state, data, parameters, tile, cells, bar, data_bar, first, la
 
     It overwrites what `p2g_adjoint` gathered but for A_bar.
     """
-    ground, dt, per_dx, none = parameters.ground, parameters.dt, parameters.per_dx, nothing(cells)
+    ground, gathered, dt, per_dx = (
+        parameters.ground,
+        tile.gathered,
+        parameters.dt,
+        parameters.per_dx,
+    )
     for g in range(first, last):
         if not is_clear(state, parameters, g):
             t = g - first
             for k in range(4):
-                if pushed(state, data, parameters, tile, g, t, k):
-                    push = record_of_push(tile, t, k)
-                    slope_x, slope_y = slopes(cells, tile, t, k, push, none, none)
-                    mean, _, _ = moments(cells, tile, t, k)
-                    qx, qy, force_bar = mean[0], mean[1], mean[3]
-                    add_number(bar, at(g, POSITION), k, per_dx * total(slope_x))
-                    add_number(bar, at(g, POSITION + 1), k, per_dx * total(slope_y))
-                    x, y = number(state, at(g, POSITION), k), number(state, at(g, POSITION + 1), k)
-                    volume = number(data.volume, g, k)
-                    share = number(data.stiffness, g, k) * volume
-                    for n in range(len(ground.layers)):
-                        thickness, stiffness = (
-                            ground.layers[n, THICKNESS],
-                            ground.layers[n, STIFFNESS],
-                        )
-                        d, nx, ny, bend = distance(x, y, ground, n)
-                        b = bearing(d, thickness, stiffness * share)
-                        b_bar = force_bar + dt * (nx * qx + ny * qy)
+                x, y = number(state, at(g, POSITION), k), number(state, at(g, POSITION + 1), k)
+                volume = number(data.volume, g, k)
+                share = number(data.stiffness, g, k) * volume
+                for n in range(len(ground.layers)):
+                    thickness, stiffness = ground.layers[n, THICKNESS], ground.layers[n, STIFFNESS]
+                    d, nx, ny, bend = distance(x, y, ground, n)
+                    b = bearing(d, thickness, stiffness * share)
+                    if b.real > 0.0:
+                        store_push(gathered, t, k, dt * b * nx, dt * b * ny, b)
+                        push = load_push(gathered, t, k)
+                        mean, along_x, along_y = value_and_slopes(cells, tile, t, k)
+                        qx, qy, b_bar = dt * mean[0], dt * mean[1], mean[3]
+                        b_bar = b_bar + nx * qx + ny * qy
                         d_bar, capacity_bar = bearing_adjoint(
                             d, thickness, stiffness * share, b_bar
                         )
-                        x_bar, y_bar = distance_adjoint(
-                            nx, ny, bend, d_bar, dt * b * qx, dt * b * qy
-                        )
+                        x_bar, y_bar = distance_adjoint(nx, ny, bend, d_bar, b * qx, b * qy)
+                        x_bar = x_bar + per_dx * total(along_x * push)
+                        y_bar = y_bar + per_dx * total(along_y * push)
                         add_number(bar, at(g, POSITION), k, x_bar)
                         add_number(bar, at(g, POSITION + 1), k, y_bar)
                         add_number(data_bar.stiffness, g, k, stiffness * volume * capacity_bar)
+
+
+@jit
+def store_push(gathered, t, k, px, py, force):
+    """The impulse dt b n of a layer on particle k of a group, and b, as numbers of the arrays."""
+    set_number(gathered, in_tile(t, VELOCITY_BAR), k, px)
+    set_number(gathered, in_tile(t, VELOCITY_BAR + 1), k, py)
+    set_number(gathered, in_tile(t, MASS_BAR), k, force)
+
+
+@jit
+def load_push(gathered, t, k):
+    """What `store_push` wrote, as what it puts on nodes: (q_x, q_y, 0, f_N)."""
+    px = number(gathered, in_tile(t, VELOCITY_BAR), k)
+    py = number(gathered, in_tile(t, VELOCITY_BAR + 1), k)
+    return pack(px, py, 0.0 * px, number(gathered, in_tile(t, MASS_BAR), k))

@@ -187,6 +187,35 @@ def slopes_row(cells, c, tile, g, k):
 
 
 @jit
+def deposit_value(cells, tile, g, k, f):
+    """Add the moments of w f alone, as `deposit` does with a = b = 0."""
+    c = COEFFICIENTS * int(number(tile.cell, g, k))
+    tx, hx, _ = place_along_x(tile, g, k)
+    ty, hy, _ = place_along_y(tile, g, k)
+    tf, hf = tx * f, hx * f
+    add(cells, c, f)
+    add(cells, c + 1, ty * f)
+    add(cells, c + 2, hy * f)
+    add(cells, c + 3, tf)
+    add(cells, c + 4, ty * tf)
+    add(cells, c + 5, hy * tf)
+    add(cells, c + 6, hf)
+    add(cells, c + 7, ty * hf)
+    add(cells, c + 8, hy * hf)
+
+
+@jit
+def value_and_slopes(cells, tile, g, k):
+    """The cells' field at particle k of a group, and its derivatives along x and y, per cell."""
+    c = COEFFICIENTS * int(number(tile.cell, g, k))
+    tx, hx, _ = place_along_x(tile, g, k)
+    f0, _, s0, _ = slopes_row(cells, c, tile, g, k)
+    f1, _, s1, _ = slopes_row(cells, c + 3, tile, g, k)
+    f2, _, s2, _ = slopes_row(cells, c + 6, tile, g, k)
+    return f0 + tx * f1 + hx * f2, f1 + tx * f2, s0 + tx * s1 + hx * s2
+
+
+@jit
 def interpolation(position, dx, rows):
     """Nodes and weights (N, 9) of particles at (N, 2); node (i, j) has number i * rows + j."""
     nodes = np.empty((position.shape[0], 9), np.int64)

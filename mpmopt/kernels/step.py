@@ -109,7 +109,7 @@ def advance(states, grids, windows, logs, first, last, data, parameters, signal,
             if not meet(barrier_state, threads):
                 return n, ABANDONED, -1
         for a in columns:
-            grid_update(grid, window, parameters, scratch.velocity, a)
+            grid_update(grid, window, parameters, parameters.clamps[n], scratch.velocity, a)
         if not meet(barrier_state, threads):
             return n, ABANDONED, -1
         for k in own:
@@ -148,7 +148,7 @@ def advance_adjoint(states, grids, windows, logs, first, last, data, parameters,
         ni, window = w[2], (w[0], w[1], w[2], w[3])
         columns = range(thread * ni // threads, (thread + 1) * ni // threads)
         for a in columns:
-            grid_update(grid, window, parameters, velocity, a)
+            grid_update(grid, window, parameters, parameters.clamps[n], velocity, a)
         if not meet(barrier_state, threads):
             return
         for k in own:
@@ -175,7 +175,9 @@ def advance_adjoint(states, grids, windows, logs, first, last, data, parameters,
         for a in columns:
             for field in range(fields):
                 add_blocks(parts_bar, field, windows[n], window, a, velocity_bar[field])
-            grid_update_adjoint(grid, window, parameters, velocity_bar, scratch.node_bar, a)
+            grid_update_adjoint(
+                grid, window, parameters, parameters.clamps[n], velocity_bar, scratch.node_bar, a
+            )
         if not meet(barrier_state, threads):
             return
         if parameters.mirror_axis >= 0:

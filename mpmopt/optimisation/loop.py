@@ -14,7 +14,7 @@ from mpmopt.assess import refinement
 from mpmopt.assess.threshold import post_processed
 from mpmopt.design.chain import non_discreteness
 from mpmopt.design.problem import Problem
-from mpmopt.design.task import DEFAULT_TASK, Task
+from mpmopt.design.task import DEFAULT_TASK, FEASIBLE, Task
 from mpmopt.errors import DesignError, SceneError, SimulationError
 from mpmopt.optimisation.history import Candidate, Iteration, Optimisation, StageState
 from mpmopt.optimisation.mma import MovingAsymptotes
@@ -192,7 +192,7 @@ def _missed(run: Optimisation) -> str:
     missed = [
         f"{constraint} is missed by {constraint.g(value) * constraint.scale:.3g}"
         for constraint, value in pairs
-        if run.task.violation(()) < constraint.g(value)
+        if constraint.g(value) > FEASIBLE
     ]
     text = f" No design met all constraints: of the best {', '.join(missed)}."
     logger.warning(text.strip())

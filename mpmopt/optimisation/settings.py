@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +17,15 @@ from mpmopt.validation import count, flag, number, share, shown
 
 # Successful evaluations of a stage before the stop rule may end it.
 LEAST = 20
+
+
+def _take(owner: Any, check: Callable[..., Any], names: str, **limits: float) -> None:
+    """Check fields, and set them to what the check makes of them; what may be None may stay so."""
+    for name in names.split():
+        value, optional = getattr(owner, name), getattr(type(owner), name, 0) is None
+        if value is not None or not optional:
+            value = check(type(owner).__name__, name, value, error=DesignError, **limits)
+        object.__setattr__(owner, name, value)
 
 
 @dataclass(frozen=True)
@@ -72,26 +81,16 @@ class Stage:
     limited: bool = True
 
     def __post_init__(self) -> None:
-        for name in ("beta", "void_density", "void_stiffness", "time_step", "move_limit"):
-            value = number("Stage", name, getattr(self, name), above=0.0, error=DesignError)
-            object.__setattr__(self, name, value)
+        _take(self, number, "beta void_density void_stiffness time_step move_limit", above=0.0)
         for name in ("void_density", "void_stiffness", "move_limit"):
             if getattr(self, name) > 1.0:
                 raise DesignError(f"Stage: {name} = {getattr(self, name)} must be at most 1")
-        void_cutoff = share("Stage", "void_cutoff", self.void_cutoff, error=DesignError)
-        object.__setattr__(self, "void_cutoff", void_cutoff)
-        for name in ("solid", "refined", "limited"):
-            value = flag("Stage", name, getattr(self, name), error=DesignError)
-            object.__setattr__(self, name, value)
+        _take(self, share, "void_cutoff")
+        _take(self, flag, "solid refined limited")
         if self.refined and not self.solid:
             raise DesignError("Stage: refined = True needs solid = True")
-        if self.most_iterations is not None:
-            most = count("Stage", "most_iterations", self.most_iterations, 1, error=DesignError)
-            object.__setattr__(self, "most_iterations", most)
-        coarsening = count("Stage", "coarsening", self.coarsening, 1, error=DesignError)
-        object.__setattr__(self, "coarsening", coarsening)
-        halvings = count("Stage", "halvings", self.halvings, 0, error=DesignError)
-        object.__setattr__(self, "halvings", halvings)
+        _take(self, count, "most_iterations coarsening", least=1)
+        _take(self, count, "halvings", least=0)
 
     def scene(self, scene: Scene) -> Scene:
         """The scene as this stage simulates it."""
@@ -172,16 +171,9 @@ class Settings:
         if not stages or not all(isinstance(stage, Stage) for stage in stages):
             raise DesignError(f"Settings: stages = {shown(given)} must be Stages, at least one")
         object.__setattr__(self, "stages", stages)
-        for name in ("adapt_move_limit", "sharpen_asymptotes", "best_first"):
-            value = flag("Settings", name, getattr(self, name), error=DesignError)
-            object.__setattr__(self, name, value)
-        for name in ("window", "least_iterations", "most_iterations", "most_failures"):
-            given = getattr(self, name)
-            if name != "least_iterations" or given is not None:
-                given = count("Settings", name, given, 1, error=DesignError)
-                object.__setattr__(self, name, given)
-        tolerance = number("Settings", "tolerance", self.tolerance, error=DesignError)
-        object.__setattr__(self, "tolerance", tolerance)
+        _take(self, flag, "adapt_move_limit sharpen_asymptotes best_first")
+        _take(self, count, "window least_iterations most_iterations most_failures", least=1)
+        _take(self, number, "tolerance")
         if self.least > self.most_iterations:
             raise DesignError(
                 f"Settings: least_iterations = {self.least_iterations} is above "

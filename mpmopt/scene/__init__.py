@@ -1,5 +1,6 @@
-"""What is simulated: grid, time, material, body, walls and ground."""
+"""What is simulated: grid, time, material, body, walls, ground and clamps."""
 
+from mpmopt.scene.clamp import Clamp
 from mpmopt.scene.ground import Ground
 from mpmopt.scene.parts import (
     Actuator,
@@ -18,6 +19,7 @@ from mpmopt.scene.silicones import SILICONES
 __all__ = [
     "SILICONES",
     "Actuator",
+    "Clamp",
     "Design",
     "Grid",
     "Ground",

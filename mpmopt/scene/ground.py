@@ -278,7 +278,8 @@ class Layer(NamedTuple):
         """With what follows from the scene's body, material and gravity."""
         given, speed = ground.thickness, _speed(scene)
         thickness = THICKNESS * min(scene.extent) if given is None else given
-        modulus = scene.material.density * scene.material.wave_speed**2
+        # The stiffest counts: a layer shall not give way where the body does not.
+        modulus = max(each.density * each.wave_speed**2 for each in scene.materials)
         bearing = 2.0 * BEARING * modulus / thickness
         damping, creeping = ground.damping, ground.creeping_speed
         return cls(
@@ -294,7 +295,7 @@ class Layer(NamedTuple):
 def _speed(scene: Scene) -> float:
     """Of a fall through half of the body's shorter side; without gravity of a slow wave."""
     fall = math.sqrt(math.hypot(*scene.gravity) * min(scene.extent))
-    return fall or 0.25 * scene.material.wave_speed
+    return fall or 0.25 * scene.wave_speed
 
 
 def check_ground(scene: Scene) -> None:
@@ -304,7 +305,8 @@ def check_ground(scene: Scene) -> None:
         return
     extent, (gx, gy) = scene.extent, scene.gravity
     # What is let go at the layer's end is pressed, at the deepest, three times as hard as at rest.
-    pressure = scene.material.density * (abs(gx) * extent[0] + abs(gy) * extent[1])
+    densest = max(material.density for material in scene.materials)
+    pressure = densest * (abs(gx) * extent[0] + abs(gy) * extent[1])
     for k, layer in enumerate(scene.layers):
         thickness, bears = layer.thickness, 0.5 * layer.stiffness * layer.thickness
         if thickness < 0.5 * dx * (1.0 - SAME):

@@ -15,6 +15,7 @@ from mpmopt.scene.checks import (
     check_stability,
     check_walls,
 )
+from mpmopt.scene.clamp import Clamp, check_clamps
 from mpmopt.scene.ground import Ground, Layer, check_ground
 from mpmopt.scene.parts import (
     Actuator,
@@ -54,6 +55,7 @@ class Scene(Checked):
         `Design`, `Solid` and `Actuator` rectangles that do not overlap.
     walls : tuple of Wall, optional
     ground : tuple of Ground, optional
+    clamps : tuple of Clamp, optional
     material : Material, optional
         Of the regions that have none of their own.
     gravity : (float, float), optional
@@ -99,12 +101,18 @@ class Scene(Checked):
     blend_time: float = 0.0
     transient: float = 0.0
     ground: tuple[Ground, ...] = ()
+    clamps: tuple[Clamp, ...] = ()
 
     def __post_init__(self) -> None:
         for name, kind in (("grid", Grid), ("material", Material)):
             if not isinstance(getattr(self, name), kind):
                 raise SceneError(f"Scene: {name} must be a {kind.__name__}")
-        for name, part in (("body", Region), ("walls", Wall), ("ground", Ground)):
+        for name, part in (
+            ("body", Region),
+            ("walls", Wall),
+            ("ground", Ground),
+            ("clamps", Clamp),
+        ):
             value = getattr(self, name)
             if not isinstance(value, (tuple, list)) or not all(isinstance(v, part) for v in value):
                 raise SceneError(f"Scene: {name} must be a tuple of {part.__name__} objects")
@@ -162,6 +170,7 @@ class Scene(Checked):
         check_size(self)
         check_walls(self)
         check_ground(self)
+        check_clamps(self)
         check_mirror(self)
         check_stability(self)
 
@@ -179,6 +188,9 @@ class Scene(Checked):
             f"{ground.friction})"
             for ground in self.ground
         )
+        if self.clamps:
+            moved = sum(bool(clamp.path) for clamp in self.clamps)
+            ground += f"; {len(self.clamps)} clamps, of which {moved} move"
         mirror = ""
         if self.mirror is not None:
             mirror = f", symmetric about {self.mirror.axis} = {self.mirror.position:g}"

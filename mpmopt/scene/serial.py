@@ -8,6 +8,7 @@ from collections import Counter
 from typing import Any
 
 from mpmopt.errors import SceneError
+from mpmopt.scene.clamp import Clamp
 from mpmopt.scene.ground import Ground
 from mpmopt.scene.parts import Actuator, Design, Grid, Material, Mirror, Solid, Wall
 from mpmopt.validation import shown
@@ -61,7 +62,7 @@ def parsed(scene_type: type, text: str) -> Any:
                 item["material"] = _build(Material, item["material"])
             regions.append(_build(kinds[name], item))
         data["body"] = tuple(regions)
-    for name, kind in (("walls", Wall), ("ground", Ground)):
+    for name, kind in (("walls", Wall), ("ground", Ground), ("clamps", Clamp)):
         if name in data:
             data[name] = tuple(_build(kind, item) for item in _array(name, data[name]))
     return _build(scene_type, data)

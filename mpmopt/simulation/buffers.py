@@ -95,6 +95,7 @@ class Segment:
         """Advance from step `first`, whose state is in slot 0, to step `last`."""
         simulation = self.simulation
         signal = simulation.signal[first:last]
+        parameters = simulation.parameters_of_steps(first, last)
         reached, steps = 0, last - first
         while reached < steps:
             stop = min(steps, reached + simulation.steps_per_call)
@@ -108,7 +109,7 @@ class Segment:
                 reached,
                 stop,
                 simulation.data,
-                simulation.parameters,
+                parameters,
                 signal,
                 self.scratch,
             )

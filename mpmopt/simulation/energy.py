@@ -87,7 +87,12 @@ class Balance:
 
     @property
     def appeared(self) -> float:
-        """Greatest rise, as a share of what kinetic and potential energy and work turned over."""
+        """Greatest rise, as a share of what kinetic and potential energy and work turned over.
+
+        Clamps that move do work, which nobody counts: then it is zero.
+        """
+        if self._parameters.clamps[..., 4:].any():
+            return 0.0
         if math.isinf(self._rise):
             return math.inf
         return self._rise / max(self._turnover, self._rounding)

@@ -92,6 +92,13 @@ def step(simulation: Simulation, state: NDArray, n: int) -> NDArray:
                 scene, np.array([i, j]) * dx, u[:, i, j], dt * force[i, j] / mass[i, j]
             )
         meet_walls(scene, np.array([i, j]) * dx, u[:, i, j])
+        for clamp in scene.clamps:
+            t, place = dt * np.array([n, n + 1]), np.array([i, j]) * dx
+            before, after = clamp.displacement(t)
+            low, high = before + clamp.lower - place, before + clamp.upper - place
+            if (low <= 1e-6 * dx).all() and (high >= -1e-6 * dx).all():
+                u[:, i, j] = (after - before) / dt
+                break
         u_old[:, i, j] = q_old[:, i, j] / mass[i, j]
 
     # grid to particle, and blend

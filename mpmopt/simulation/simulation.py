@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -186,6 +186,24 @@ class Simulation:
             kept.append(kernels.ungrouped(states[0], *self.initial.shape))
         return kept[-1] if frames is None else np.array(kept)
 
+    def states(self) -> Iterator[NDArray]:
+        """The states (12, N) after 0, 1, ... steps, one after the other.
+
+        Raises
+        ------
+        SimulationError
+            As `run`.
+        """
+        memory = Segment(self, min(WATCH, self.steps), Memory())
+        memory.states[0] = kernels.grouped(self.initial)
+        yield self.initial
+        for first in range(0, self.steps, WATCH):
+            last = min(first + WATCH, self.steps)
+            memory.advance(first, last)
+            for slot in range(1, last - first + 1):
+                yield kernels.ungrouped(memory.states[slot], *self.initial.shape)
+            memory.states[0] = memory.states[last - first]
+
     def watch(self, instants: Collection[int] = ()) -> Watched:
         """Run forward: how the run ends, and how close it came to failure.
 
@@ -223,6 +241,10 @@ class Simulation:
         reference = kernels.grouped(self.particles.position.T)
         found = kernels.closest(records, reference, solid, self.data, self.parameters)
         return tuple(float(value) for value in found)  # type: ignore[return-value]
+
+    def parameters_of_steps(self, first: int, last: int) -> kernels.Parameters:
+        """The surroundings, in which step `first` is number 0."""
+        return self.parameters._replace(clamps=self.parameters.clamps[first:last])
 
     @property
     def fields(self) -> int:
@@ -414,7 +436,7 @@ class Forward:
                     start,
                     stop,
                     simulation.data,
-                    simulation.parameters,
+                    simulation.parameters_of_steps(first, last),
                     simulation.signal[first:last],
                     memory.scratch,
                     bar,

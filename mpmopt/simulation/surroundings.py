@@ -26,6 +26,10 @@ def parameters_of(scene: Scene) -> kernels.Parameters:
             -1, len(contact.COLUMNS)
         ),
         ground=_ground_of(scene),
+        clamps=np.array([clamp.rows(scene) for clamp in scene.clamps])
+        .reshape(-1, scene.steps, 6)
+        .swapaxes(0, 1)
+        .copy(),
         mirror_axis=-1 if scene.mirror is None else scene.mirror.normal,
         mirror_node=0 if scene.mirror is None else round(scene.mirror.position / dx),
         viscous=any(material.viscosity > 0.0 for material in scene.materials),

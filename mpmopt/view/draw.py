@@ -15,7 +15,7 @@ from matplotlib.backend_bases import RendererBase
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import Collection
 from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
+from matplotlib.patches import Polygon, Rectangle
 from matplotlib.path import Path as Outline
 from matplotlib.transforms import Affine2D
 from numpy.typing import ArrayLike, NDArray
@@ -23,13 +23,15 @@ from numpy.typing import ArrayLike, NDArray
 from mpmopt.assess.trajectory import Motion, optimised
 from mpmopt.design.problem import Problem
 from mpmopt.optimisation.history import Optimisation
-from mpmopt.scene import Scene
+from mpmopt.scene import Ground, Scene
 
 RED, BLUE = (0.85, 0.1, 0.1), (0.1, 0.25, 0.85)
 # Particles are drawn so much wider than they are that no light shows between neighbours.
 OVERLAP = 1.15
 # Particles with less material than this are not drawn.
 FAINTEST = 0.02
+# What is rigid.
+SOLID: dict[str, Any] = {"facecolor": "0.88", "edgecolor": "0.6", "hatch": "//", "lw": 0.8}
 
 
 @contextmanager
@@ -76,14 +78,14 @@ def format_of(values: ArrayLike) -> str:
 
 
 def draw_walls(axes: Axes, scene: Scene, moving: bool = False) -> None:
-    """Draw the walls, as far as the axes reach now.
+    """Draw the walls, the ground, and clamps with their ways, as far as the axes reach now.
 
     Parameters
     ----------
     axes : matplotlib Axes
     scene : Scene
     moving : bool, optional
-        Draw them where bodies rest on them in motion, not where they begin to act: the centres of
+        Draw walls where bodies rest on them in motion, not where they begin to act: the centres of
         the lowest particles come to rest there, and the squares reach half their width further.
     """
     deeper = 0.5 * scene.grid.dx / scene.particles_per_cell if moving else 0.0
@@ -99,9 +101,29 @@ def draw_walls(axes: Axes, scene: Scene, moving: bool = False) -> None:
             if wall.axis == "x"
             else ((left, start), right - left, end - start)
         )
-        axes.add_patch(
-            Rectangle(corner, width, height, facecolor="0.88", edgecolor="0.6", hatch="//", lw=0.8)
-        )
+        axes.add_patch(Rectangle(corner, width, height, **SOLID))
+    for ground in scene.ground:
+        reach = 4.0 * (right - left + high - low)
+        axes.add_patch(Polygon(ground_outline(ground, reach), **SOLID))
+    for clamp in scene.clamps:
+        width, height = np.subtract(clamp.upper, clamp.lower)
+        axes.add_patch(Rectangle(clamp.lower, width, height, fill=False, edgecolor="C1", ls="--"))
+        way = np.array([d for _, d in clamp.path]).reshape(-1, 2)
+        axes.plot(*(way + np.add(clamp.lower, clamp.upper) / 2.0).T, color="C1", lw=0.8)
+
+
+def ground_outline(ground: Ground, reach: float) -> NDArray[np.float64]:
+    """Corners (n, 2) of the ground's solid, as far as it reaches around its points."""
+    line, points = ground.line, np.array(ground.points)
+    middle = points.mean(axis=0)
+    reach += float(np.hypot(*(points - middle).T).max())
+    ends = points[0] - reach * line.along[0], points[-1] + reach * line.along[-1]
+    # Back from the last end to the first, clockwise: on the way's right-hand side.
+    last, first = (float(np.arctan2(*(end - middle)[::-1])) for end in ends[::-1])
+    turn = (last - first) % (2.0 * np.pi)
+    angles = last - np.linspace(0.0, turn, 18)[1:-1]
+    around = middle + 2.0 * reach * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    return np.concatenate([ends[:1], points, ends[1:], around])
 
 
 class Squares(Collection):

@@ -7,8 +7,10 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 from matplotlib.figure import Figure
 
+from mpmopt.assess.forces import Books
 from mpmopt.assess.trajectory import Body, Motion, equal_steps, optimised, post_processed, reference
 from mpmopt.errors import SimulationError
 from mpmopt.io.files import replace_file
@@ -82,6 +84,47 @@ def plot_history(path: str | os.PathLike[str], run: Optimisation) -> None:
     axes = figure.add_subplot()
     draw_history(axes, run)
     axes.set_title("History of the optimisation", pad=32.0)
+    replace_file(path, png(figure))
+
+
+@own_style()
+def plot_forces(path: str | os.PathLike[str], name: str, books: Books) -> None:
+    """Write a PNG of a motion's energy, the work done on it, and its supports' forces over time.
+
+    Parameters
+    ----------
+    path : Path
+    name : str
+        Of the body.
+    books : Books
+
+    Raises
+    ------
+    StorageError
+        If the file cannot be written.
+    """
+    figure = new_figure(7.0, 10.0)
+    figure.suptitle(f"{name[0].upper()}{name[1:]}, who bears it and who drives it")
+    energy, work, force, place = figure.subplots(4, 1, sharex=True)
+    for kind, values in books.energy.items():
+        if np.ptp(values) > 1e-9 * books.turnover:
+            energy.plot(books.time, values - values[0], lw=1, label=kind)
+    for kind, values in books.work.items():
+        if np.ptp(values) > 1e-9 * books.turnover:
+            work.plot(books.time, values, lw=1, label=kind)
+    work.plot(books.time, books.residual, "k:", lw=1, label="unexplained")
+    time, forces, places = books.means()
+    for k, support in enumerate(books.supports):
+        for axis, style in ((1, "-"), (0, "--")):
+            label = f"{support}, {'xy'[axis]}"
+            force.plot(time, forces[:, k, axis], f"C{k}{style}", lw=1, label=label)
+            place.plot(time, places[:, k, axis], f"C{k}{style}", lw=1, label=label)
+    texts = "change of energy", "work done so far", "force on the body", "place of the force"
+    for axes, text in zip((energy, work, force, place), texts):
+        axes.set_ylabel(text)
+        if axes.lines:
+            axes.legend(fontsize=7, frameon=False, ncols=2)
+    place.set_xlabel("time t")
     replace_file(path, png(figure))
 
 

@@ -24,7 +24,7 @@ MOST_INTERVALS = 8
 def schematic(scene: Scene) -> Figure:
     """A figure of a scene: what is designed, what squeezes, where it stands and shall go.
 
-    Lengths are in the scene's unit. Walls are where they begin to act.
+    Lengths are in the scene's unit. Walls are where they begin to act, ground where it is.
     """
     corners = np.array([(region.lower, region.upper) for region in scene.body])
     box = np.array([corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)])
@@ -133,7 +133,7 @@ def _draw_arrows(
 
 
 def _label_walls(axes: Axes, scene: Scene, seen: NDArray[np.float64]) -> None:
-    """Say what each wall that is in view does to what slides on it."""
+    """Say what each wall and ground that is in view does to what slides on it."""
     for wall in scene.walls:
         k = "xy".index(wall.axis)
         low, high = seen[:, k]
@@ -143,6 +143,13 @@ def _label_walls(axes: Axes, scene: Scene, seen: NDArray[np.float64]) -> None:
             at[1 - k] = seen[:, 1 - k] @ [0.12, 0.88]
             text = "stick" if wall.friction == "stick" else f"friction {wall.friction:.4g}"
             _label(axes, at, text, upright=k == 0)
+    places = np.meshgrid(*(np.linspace(low, high, 21)[1:-1] for low, high in seen.T))
+    for ground in scene.ground:
+        d, _ = ground.distance(np.array(places))
+        if d.min() < -0.03 * float(np.ptp(seen[:, 1])):
+            deepest = np.unravel_index(d.argmin(), d.shape)
+            text = "stick" if ground.friction == "stick" else f"friction {ground.friction:.4g}"
+            _label(axes, [float(axis[deepest]) for axis in places], text)
 
 
 def _arrow(

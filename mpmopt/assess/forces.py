@@ -1,0 +1,348 @@
+"""The books of a motion: its energy and who gives and takes it, and the forces that bear it.
+
+A second look at every step, in NumPy, beside the kernels that made it (docs: theory, "Forces").
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from mpmopt import kernels
+from mpmopt.assess.trajectory import with_image
+from mpmopt.scene import Scene
+from mpmopt.simulation.simulation import Simulation
+
+# What a state has, and what it is given (less than zero: what is taken from it).
+ENERGIES = ("kinetic", "elastic", "gravity", "layer")
+WORKS = ("actuation", "viscosity", "friction", "damping", "walls", "transfer")
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Books:
+    """Energy and forces of a body in S steps; of a scene with a mirror both halves count.
+
+    Attributes
+    ----------
+    scene : Scene
+    time : (S + 1,) array
+    energy : dict of str to (S + 1,) array
+        By kind: kinetic, with what the affine velocity has; elastic; gravity; and what the grounds'
+        layers store.
+    work : dict of str to (S + 1,) array
+        What was done so far, by whom: actuation, viscosity, friction and damping of grounds, walls
+        in all, and transfer between particles and nodes, of which no body knows.
+    supports : tuple of str
+        The scene's grounds in their order, and its walls as one.
+    force : (S, P, 2) array
+        Of each of P supports on the body, mean of a step.
+    place : (S, P, 2) array
+        Where it acts: the mean place of a ground's normal force, and of what walls do; not a number
+        where there is none.
+    weight : float
+    travel : float
+        Of the centre of mass, along the scene's direction.
+    actuation : float
+        Work of actuators that do work; those that get work back do not give it to others.
+    """
+
+    scene: Scene
+    time: Array
+    energy: dict[str, Array]
+    work: dict[str, Array]
+    supports: tuple[str, ...]
+    force: Array
+    place: Array
+    weight: float
+    travel: float
+    actuation: float
+
+    @property
+    def residual(self) -> Array:
+        """Energy (S + 1,) that no work explains: the error of the steps."""
+        total = np.sum([*self.energy.values()], axis=0)
+        return total - total[0] - np.sum([*self.work.values()], axis=0)
+
+    @property
+    def turnover(self) -> float:
+        """Kinetic energy at first, and all changes of potential energy and of works."""
+        changes = [self.energy[kind] for kind in ENERGIES[1:]] + list(self.work.values())
+        moved = sum(float(np.abs(np.diff(each)).sum()) for each in changes)
+        return float(self.energy["kinetic"][0]) + moved
+
+    @property
+    def cost_of_transport(self) -> float:
+        """Actuators' work over weight and travel's size; infinite if there is no such product."""
+        carried = self.weight * abs(self.travel)
+        return self.actuation / carried if carried > 0.0 else math.inf
+
+    def means(self, count: int = 200) -> tuple[Array, Array, Array]:
+        """Forces and places over so many equal parts of the time, as steps alone are rough.
+
+        Returns
+        -------
+        (T,) array of the parts' middles, (T, P, 2) forces, (T, P, 2) places; T is `count`, or the
+        number of steps if that is less
+        """
+        steps = len(self.force)
+        starts = np.arange(min(count, steps)) * steps // min(count, steps)
+
+        def summed(values: Array) -> Array:
+            return np.add.reduceat(values, starts)
+
+        lengths = np.diff(starts, append=steps)
+        there = np.isfinite(self.place)
+        often = summed(there.astype(float))
+        place = np.divide(
+            summed(np.where(there, self.place, 0.0)),
+            often,
+            out=np.full(often.shape, np.nan),
+            where=often > 0.0,
+        )
+        middle = self.time[starts] + 0.5 * self.scene.time_step * lengths
+        return middle, summed(self.force) / lengths[:, None, None], place
+
+
+def books(simulation: Simulation, progress: Callable[[], None] | None = None) -> Books:
+    """Run a body and keep its books.
+
+    Parameters
+    ----------
+    simulation : Simulation
+    progress : callable, optional
+        Called after every step.
+
+    Raises
+    ------
+    SimulationError
+        As `Simulation.run` does.
+    """
+    steps, scene, account = simulation.steps, simulation.scene, _Account(simulation)
+    supports = tuple(f"ground {k}" for k in range(len(scene.layers)))
+    supports += ("walls",) * bool(scene.walls)
+    energies, works = np.empty((steps + 1, len(ENERGIES))), np.zeros((steps + 1, len(WORKS)))
+    force, place = np.empty((2, steps, len(supports), 2))
+    states = _states(simulation)
+    first = old = next(states)
+    held, given = account.held(old), 0.0
+    energies[0] = account.energies(old)
+    for n, new in enumerate(states):
+        signal, before, held = simulation.signal[n].real, held, account.held(new)
+        work = -signal * (held - before)
+        given += float(np.maximum(work, 0.0).sum())
+        energies[n + 1] = account.energies(new)
+        others, force[n], place[n] = account.step(old, new, signal, n)
+        works[n + 1] = work.sum(), *others
+        old = new
+        if progress is not None:
+            progress()
+    moved = account.mass @ (old[:2] - first[:2]).T / account.mass.sum()
+    return Books(
+        scene=scene,
+        time=scene.time_step * np.arange(steps + 1.0),
+        energy=dict(zip(ENERGIES, energies.T)),
+        work=dict(zip(WORKS, np.add.accumulate(works).T)),
+        supports=supports,
+        force=force,
+        place=place,
+        weight=float(account.mass.sum()) * math.hypot(*scene.gravity),
+        travel=float(moved @ scene.direction),
+        actuation=given,
+    )
+
+
+def _states(simulation: Simulation) -> Iterator[Array]:
+    """States (12, N) after 0, 1, ... steps; of a scene with a mirror (12, 2 N)."""
+    mirror = simulation.scene.mirror
+    for state in simulation.states():
+        yield state.real if mirror is None else with_image(state.real, mirror)
+
+
+class _Account:
+    """What a step does with energy, of N particles and M nodes."""
+
+    def __init__(self, simulation: Simulation) -> None:
+        self.scene = scene = simulation.scene
+        self.layers = scene.layers
+        data, count = simulation.data, simulation.initial.shape[1]
+        halves = 1 if scene.mirror is None else 2
+
+        def of_particles(values: NDArray) -> Array:
+            return np.tile(kernels.ungrouped(values.real, 1, count)[0].astype(float), halves)
+
+        self.volume, self.mass = of_particles(data.volume), of_particles(data.mass)
+        self.stiffness = of_particles(data.stiffness)
+        self.constants = [self.stiffness * of_particles(values) for values in data.constants]
+        actuated = [of_particles(there) for there in data.actuated]
+        self.actuated = np.reshape(actuated, (len(actuated), len(self.mass)))
+        self.stress = np.array([actuator.stress for actuator in scene.actuators]).reshape(-1, 2, 2)
+        whole = simulation.parameters._replace(keep=0.0, mirror_axis=-1)
+        self.parameters = whole._replace(walls=whole.walls[:0]), whole
+        self.cells = scene.grid.cells[0] + 1, scene.grid.cells[1] + 1
+        i, j = np.divmod(np.arange(self.cells[0] * self.cells[1]), self.cells[1])
+        self.nodes = np.stack([i, j]) * scene.grid.dx  # their places (2, M)
+        lines = [layer.line.distance(self.nodes) for layer in self.layers]
+        self.ground = np.argmin([d for d, _ in lines], axis=0) if lines else np.zeros(i.size, int)
+        self.normal = np.array([n for _, n in lines] or np.zeros((1, *self.nodes.shape)))
+        self.normal = self.normal[self.ground, :, np.arange(i.size)].T
+
+    def _midway(self, state: Array) -> tuple[Array, Array]:
+        """Where particles are and how deformed, (2, N) and (2, 2, N), when they have v and C."""
+        dt = self.scene.time_step
+        x, v, C, F = kernels.parts(state)
+        return x - 0.5 * dt * v, F + 0.5 * dt * _product(C, F)
+
+    def _motion(self, v: Array, C: Array) -> float:
+        """Kinetic energy."""
+        inertia = 0.25 * self.scene.grid.dx**2
+        return 0.5 * float((self.mass * v**2).sum() + inertia * (self.mass * C**2).sum())
+
+    def _bearing(self, x: Array) -> tuple[Array, Array]:
+        """Normal forces (K, N) of layers on particles, and the unit normals (K, 2, N)."""
+        forces, normals = np.empty((len(self.layers), x.shape[1])), []
+        for force, layer in zip(forces, self.layers):
+            d, normal = layer.line.distance(x)
+            force[:] = self.stiffness * self.volume * layer.stiffness
+            force *= np.maximum(1.0 - d / layer.thickness, 0.0)
+            normals.append(normal)
+        return forces, np.array(normals).reshape(-1, *x.shape)
+
+    def energies(self, state: Array) -> tuple[float, ...]:
+        """`ENERGIES` of a state."""
+        _, v, C, _ = kernels.parts(state)
+        x, F = self._midway(state)
+        log_J = np.log(F[0, 0] * F[1, 1] - F[0, 1] * F[1, 0])
+        density = kernels.plain(kernels.energy_density)(F.reshape(4, -1), log_J, self.constants)
+        borne, _ = self._bearing(x)
+        share = 2.0 * self.stiffness * self.volume
+        layer = sum(
+            float((b**2 / share).sum()) * layer.thickness / layer.stiffness
+            for b, layer in zip(borne, self.layers)
+        )
+        fallen = -float((self.mass * x).sum(axis=1) @ self.scene.gravity)
+        return self._motion(v, C), float((self.volume * density).sum()), fallen, layer
+
+    def held(self, state: Array) -> Array:
+        """What each actuator squeezes (K,): V/2 S : F^T F."""
+        _, F = self._midway(state)
+        stretch = np.einsum("kab,cap,cbp->kp", self.stress, F, F)
+        return 0.5 * (self.actuated * stretch * self.volume).sum(axis=1)
+
+    def step(
+        self, old: Array, new: Array, signal: Array, n: int
+    ) -> tuple[tuple[float, ...], Array, Array]:
+        """`WORKS` of a step but for the first, and every support's force and place (P, 2)."""
+        dt, dx = self.scene.time_step, self.scene.grid.dx
+        x, v, C, _ = kernels.parts(old)
+        _, v_new, C_new, F = kernels.parts(new)
+
+        # Stress: elastic, of actuators, viscous.
+        log_J = np.log(F[0, 0] * F[1, 1] - F[0, 1] * F[1, 0])
+        xx, xy, yy = kernels.plain(kernels.kirchhoff)(F.reshape(4, -1), log_J, self.constants)
+        sS = np.einsum("k,kp,kab->abp", signal, self.actuated, self.stress)
+        FT = F.transpose(1, 0, 2)
+        B, D = _product(F, FT), 0.5 * (C + C.transpose(1, 0, 2))
+        viscous = self.constants[kernels.PARAMETERS.index("viscosity")]
+        viscous = viscous * _product(_product(B, D), B)
+        tau = np.array([[xx, xy], [xy, yy]]) + _product(_product(F, sS), FT) + viscous
+
+        # Particles to grid: momentum as it was, and what forces add.
+        N, Nx, Ny = self._interpolation(x)
+        borne, normal = self._bearing(x)
+        push = (borne[:, None] * normal).sum(axis=0)
+        A = -dt * self.volume * (4.0 / dx**2) * tau
+        affine = self.mass * C
+        m = N.T @ self.mass
+        there = m > self.parameters[1].mass_tolerance
+        per_m = np.divide(1.0, m, out=np.zeros_like(m), where=there)
+        q = N.T @ (self.mass * v).T + Nx.T @ affine[:, 0].T + Ny.T @ affine[:, 1].T
+        added = N.T @ (dt * push).T + Nx.T @ A[:, 0].T + Ny.T @ A[:, 1].T
+
+        # Velocities of nodes: as they were, after forces, after grounds, after walls.
+        u_old = q * per_m[:, None]
+        grid = np.zeros((1, len(m), kernels.NODE_SIZE))
+        grid[0, :, :2], grid[0, :, 2], grid[0, :, 3] = q + added, m, N.T @ borne.sum(axis=0)
+        u_free = (q + added) * per_m[:, None] + dt * there[:, None] * self.scene.gravity
+        window, after = (0, 0, *self.cells), np.zeros((2, 1, 2 * len(m)))
+        clamps = self.parameters[1].clamps[n]
+        for parameters, held_too, velocity in zip(self.parameters, (clamps[:0], clamps), after):
+            kernels.update_nodes(grid, window, parameters, held_too, velocity)
+        u_ground, u = after.reshape(2, -1, 2)
+        u_mean = 0.5 * (u_old + u)
+
+        # Impulses of grounds and walls, whose work is that on the mean velocity.
+        held = grid[0, :, 3] > 0.0
+        impulse = (held * m)[:, None] * (u_ground - u_free)
+        resisting = (impulse * self.normal.T).sum(axis=1)[:, None] * self.normal.T
+        stopping = m[:, None] * (u - u_free) - impulse
+        stopping[np.abs(stopping) <= 1e-13 * m[:, None] * np.abs(u_free).max()] = 0.0  # rounding
+        damping = float((resisting * u_mean).sum())
+        friction = float(((impulse - resisting) * u_mean).sum())
+        walls = float((stopping * u_mean).sum())
+
+        # Grid to particles, which take up less than nodes give, in motion, F and x.
+        v_mean = (N @ u_mean).T
+        C_mean = (4.0 / dx**2) * np.stack([(Nx @ u_mean).T, (Ny @ u_mean).T], axis=1)
+        (x_old, F_old), (x_new, F_new) = self._midway(old), self._midway(new)
+        strain, moved = _product(F_new - F_old, _inverse(F)), x_new - x_old
+        dissipated = float((self.volume * viscous * strain).sum())
+        kept = 0.5 * float((m[:, None] * (u_old**2 - u**2)).sum())
+        transfer = kept - self._motion(v, C) + self._motion(v_new, C_new)
+        transfer += float((self.volume * tau * (strain - dt * C_mean)).sum())
+        transfer += float((push * (dt * v_mean - moved)).sum())
+        works = (-dissipated, friction, damping, walls, transfer)
+        return works, *self._supports(x, borne, normal, impulse, stopping)
+
+    def _interpolation(self, x: Array) -> tuple[sparse.csr_array, ...]:
+        """Weights (N, M) of nodes at particles, and times how far nodes are along x and y."""
+        dx, count = self.scene.grid.dx, x.shape[1]
+        base = np.floor(x / dx - 0.5).astype(int)
+        t = x / dx - base - 1.0  # from the middle one of three nodes, in cells
+        w = np.array([0.5 * (0.5 - t) ** 2, 0.75 - t**2, 0.5 * (0.5 + t) ** 2])
+        away = dx * (np.array([-1.0, 0.0, 1.0])[:, None, None] - t)
+        product = w[:, None, 0] * w[None, :, 1]
+        near = np.arange(3)
+        node = (base[0] + near[:, None, None]) * self.cells[1] + base[1] + near[:, None]
+        found = []
+        for weight in (product, product * away[:, None, 0], product * away[None, :, 1]):
+            data, indices = (each.reshape(9, count).T.ravel() for each in (weight, node))
+            places = data, indices, np.arange(0, 9 * count + 1, 9)
+            found.append(sparse.csr_array(places, shape=(count, self.nodes.shape[1])))
+        return tuple(found)
+
+    def _supports(
+        self, x: Array, borne: Array, normal: Array, impulse: Array, stopping: Array
+    ) -> tuple[Array, Array]:
+        """Force and place (P, 2) of every support."""
+        dt, forces, places = self.scene.time_step, [], []
+        for k, b in enumerate(borne):
+            own = impulse[self.ground == k].sum(axis=0)
+            forces.append(normal[k] @ b + own / dt)
+            places.append(_mean(x, b))
+        if self.scene.walls:
+            forces.append(stopping.sum(axis=0) / dt)
+            places.append(_mean(self.nodes, np.hypot(*stopping.T)))
+        return np.reshape(forces, (-1, 2)), np.reshape(places, (-1, 2))
+
+
+def _mean(places: Array, weights: Array) -> Array:
+    """Mean of places (2, N), not a number if weights (N,) are zero."""
+    total = weights.sum()
+    return (places * weights).sum(axis=1) / total if total > 0.0 else np.full(2, np.nan)
+
+
+def _product(a: Array, b: Array) -> Array:
+    """Products of tensors (2, 2, N)."""
+    return np.einsum("ijp,jkp->ikp", a, b)
+
+
+def _inverse(F: Array) -> Array:
+    """Inverses of tensors (2, 2, N)."""
+    adjugate = np.array([[F[1, 1], -F[0, 1]], [-F[1, 0], F[0, 0]]])
+    return adjugate / (F[0, 0] * F[1, 1] - F[0, 1] * F[1, 0])
