@@ -99,7 +99,7 @@ def displacement(
         for value in (strength * START["a"], START["theta"], strength * START["b"])
     )
     keep = legs(particles.position[particles.designed])
-    simulation, _ = solid_body(scene, keep, Variables(np.zeros(0), a, theta, b))
+    simulation = solid_body(scene, keep, Variables(np.zeros(0), a, theta, b))
     row: dict[str, Any] = {
         "choice": choice.name, "cells": cells, "step": scene.time_step,
         "displacement": np.nan, "stretch": np.nan, "failure": "",
