@@ -58,7 +58,7 @@ def crawler_on_ground(cells: int, time_step: float, periods: int) -> Scene:
         material=Material(viscosity=0.02),
         steps=round((1.0 + periods * 2.0 * np.pi / omega) / time_step),
         transient=1.0,
-        filter_length=1.5 * c,
+        filter_length=2 * c,  # with thinner legs the grey stages fail
     )
 
 
@@ -72,12 +72,15 @@ def slanted_legs(positions: np.ndarray) -> np.ndarray:
     return np.any([*legs, height <= 1.5 * c], axis=0)
 
 
+# A little noise: at an even start the gradient by the phase is rounding.
+START = {"phi": np.random.default_rng(1).uniform(-0.05, 0.05, 408)}  # 102 cells, 2 x 2 in each
+
 CASES = {
     "default": Case(
-        crawler_on_ground(64, 8e-4, 15), gait(8e-4, 25), slanted_legs, task=IN_ONE_PIECE
+        crawler_on_ground(64, 8e-4, 15), gait(8e-4, 25), slanted_legs, START, IN_ONE_PIECE
     ),
     "preview": Case(
-        crawler_on_ground(64, 8e-4, 10), gait(8e-4, 12), slanted_legs, task=IN_ONE_PIECE
+        crawler_on_ground(64, 8e-4, 10), gait(8e-4, 12), slanted_legs, START, IN_ONE_PIECE
     ),
     "paper": Case(crawler(128, 2e-4), paper_preset(2e-4), slanted_legs),
 }
