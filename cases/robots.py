@@ -1,6 +1,6 @@
 """A table of robots: what the runs in some folders reached.
 
-    python cases/robots.py out/walker out/crawler out/climber --out docs/results/robots.csv
+python cases/robots.py out/walker out/crawler out/climber --out docs/results/robots.csv
 """
 
 import argparse
@@ -55,7 +55,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--out", required=True, type=Path, help="the table, a CSV file")
     options = parser.parse_args(arguments)
     lines = [HEADER, *(row(folder) for folder in options.folders)]
-    text = "\n".join(",".join(f'"{cell}"' if "," in cell else cell for cell in line) for line in lines)
+    text = "\n".join(
+        ",".join(f'"{cell}"' if "," in cell else cell for cell in line) for line in lines
+    )
     assert [*csv.reader(text.splitlines())][0] == [*HEADER]
     replace_file(options.out, f"{text}\n".encode())
     print(text)
