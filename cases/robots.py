@@ -5,6 +5,7 @@ python cases/robots.py out/walker out/crawler out/climber --out docs/results/rob
 
 import argparse
 import csv
+import io
 import json
 import sys
 from pathlib import Path
