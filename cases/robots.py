@@ -56,12 +56,10 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--out", required=True, type=Path, help="the table, a CSV file")
     options = parser.parse_args(arguments)
     lines = [HEADER, *(row(folder) for folder in options.folders)]
-    text = "\n".join(
-        ",".join(f'"{cell}"' if "," in cell else cell for cell in line) for line in lines
-    )
-    assert [*csv.reader(text.splitlines())][0] == [*HEADER]
-    replace_file(options.out, f"{text}\n".encode())
-    print(text)
+    table = io.StringIO()
+    csv.writer(table, lineterminator="\n").writerows(lines)
+    replace_file(options.out, table.getvalue().encode())
+    print(table.getvalue(), end="")
     return 0
 
 
