@@ -40,8 +40,8 @@ HALVINGS = range(4)
 
 
 def travel(case, blend_time: float, halvings: int) -> float:
-    """How far a drawn robot goes in one second, on 64 x 64 cells."""
-    scene = replace(case.CASES["preview"].scene, blend_time=blend_time)
+    """How far a drawn robot goes in one second on the paper's walls, on 64 x 64 cells."""
+    scene = replace(getattr(case, case.__name__)(64, 8e-4), blend_time=blend_time)
     scene = scene.vary(time_step=scene.time_step / 2**halvings)
     particles = discretise(scene)
     keep = case.slanted_legs(particles.position[particles.designed])
@@ -56,7 +56,8 @@ def designed(path: Path, blend_time: float, halvings: int) -> float:
     problem, x = run.problem(), run.result.x
     scene = replace(problem.scene.vary(time_step=8e-4 / 2**halvings), blend_time=blend_time)
     keep, signal = kept(problem, x), problem.split(x)
-    return distance(scene, keep, signal) - distance(replace(scene, steps=1), keep, signal)
+    first = replace(scene, steps=1, transient=0.0)
+    return distance(scene, keep, signal) - distance(first, keep, signal)
 
 
 def moving(scene: Scene, particles: Particles, velocity: np.ndarray, slope: np.ndarray):

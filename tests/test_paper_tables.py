@@ -40,7 +40,7 @@ def tiny(monkeypatch):
         stages = case.settings.stages[:1]
         short = dataclasses.replace(
             case,
-            scene=dataclasses.replace(case.scene, steps=50),
+            scene=dataclasses.replace(case.scene, steps=50, transient=0.0),
             settings=Settings(stages, window=1, least_iterations=2, most_iterations=2),
         )
         monkeypatch.setitem(module.CASES, "preview", short)

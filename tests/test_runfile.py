@@ -296,7 +296,7 @@ def test_postprocess_prints_the_share_of_the_retained_gain(run, path):
     value = post_processed(problem, run.result.x, 0.4)
     assert f"post-processed           {value:.4f}  (gamma >= 0.4" in done.stdout
     assert f"{(problem.gamma(run.result.x) >= 0.4).sum()} of 32" in done.stdout
-    assert "share of the gain retained" in done.stdout
+    assert "retained gain" in done.stdout
     assert "hanging on nothing" in done.stdout
 
 
