@@ -345,7 +345,12 @@ def end_a_client(number, store, log, go, scheduler):
 @pytest.mark.process
 @pytest.mark.parametrize(
     ("where", "number"),
-    [("processes", signal.SIGKILL), ("processes", signal.SIGINT), ("cluster", signal.SIGKILL)],
+    [
+        ("processes", signal.SIGKILL),
+        # Sometimes joblib's processes wait for ever on a busy machine; the cause is not found.
+        pytest.param("processes", signal.SIGINT, marks=pytest.mark.slow),
+        ("cluster", signal.SIGKILL),
+    ],
 )
 def test_after_the_client_is_ended_the_next_start_computes_what_is_missing(
     store, tmp_path, where, number, request

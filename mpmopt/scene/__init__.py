@@ -1,7 +1,7 @@
 """What is simulated: grid, time, material, body, walls, ground and clamps."""
 
 from mpmopt.scene.clamp import Clamp
-from mpmopt.scene.ground import Ground
+from mpmopt.scene.ground import Ground, Layer, Line
 from mpmopt.scene.parts import (
     Actuator,
     Design,
@@ -23,6 +23,8 @@ __all__ = [
     "Design",
     "Grid",
     "Ground",
+    "Layer",
+    "Line",
     "Material",
     "Mirror",
     "Region",
