@@ -7,7 +7,7 @@ from mpmopt.kernels.simd import load, total
 @jit
 def second_piola(data, g, signal):
     """s S of the actuators of four particles: xx, xy, yy."""
-    s00 = s01 = s11 = 0.0 * load(data.mass, g)
+    s00 = s01 = s11 = 0.0 * load(data.stiffness, g)
     for k in range(signal.size):
         there = load(data.actuated[k], g)
         s00 = s00 + signal[k] * data.actuation_stress[k, 0] * there

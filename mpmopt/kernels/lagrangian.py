@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from mpmopt.kernels.actuation import second_piola
 from mpmopt.kernels.arrays import COEFFICIENTS, clear
 from mpmopt.kernels.compiler import jit, loop_jit
 from mpmopt.kernels.ground import (
@@ -165,18 +166,6 @@ def continued(J):
     log = logarithm(safe)
     bend = slope * slope
     return log + off * slope - 0.5 * off * off * bend, slope - off * bend, 0.0 * J - bend
-
-
-@jit
-def second_piola(lattice, g, signal):
-    """s S of the actuators of four particles: xx, xy, yy."""
-    s00 = s01 = s11 = 0.0 * load(lattice.stiffness, g)
-    for k in range(signal.size):
-        there = load(lattice.actuated[k], g)
-        s00 = s00 + signal[k] * lattice.actuation_stress[k, 0] * there
-        s01 = s01 + signal[k] * lattice.actuation_stress[k, 1] * there
-        s11 = s11 + signal[k] * lattice.actuation_stress[k, 2] * there
-    return s00, s01, s11
 
 
 @jit

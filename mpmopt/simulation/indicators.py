@@ -84,17 +84,21 @@ class Watched(NamedTuple):
     indicators: Indicators
 
 
+def wanted_steps(instants: Collection[int], steps: int) -> set[int]:
+    """Steps before the states that are asked for, and the last, or a DesignError."""
+    for step in instants:
+        if not isinstance(step, (int, np.integer)) or not 0 <= step <= steps:
+            raise DesignError(
+                f"instants must be whole numbers of steps from 0 to {steps}, got {shown(step)}"
+            )
+    return {int(step) for step in (*instants, steps)}
+
+
 class Watcher:
     """What is seen of a run: its indicators so far, and the states that were asked for."""
 
     def __init__(self, simulation: Simulation, instants: Collection[int]) -> None:
-        steps = simulation.steps
-        for step in instants:
-            if not isinstance(step, (int, np.integer)) or not 0 <= step <= steps:
-                raise DesignError(
-                    f"instants must be whole numbers of steps from 0 to {steps}, got {shown(step)}"
-                )
-        self._wanted = {int(step) for step in (*instants, steps)}
+        self._wanted = wanted_steps(instants, simulation.steps)
         self.states: dict[int, NDArray] = {}
         self.simulation, self._seen = simulation, Indicators()
         self._balance = Balance(simulation.data, simulation.parameters, simulation.signal)

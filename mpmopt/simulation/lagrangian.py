@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -14,12 +13,11 @@ from numpy.typing import DTypeLike, NDArray
 from mpmopt import kernels
 from mpmopt.errors import DesignError, SimulationError
 from mpmopt.kernels import lagrangian
-from mpmopt.kernels.indicators import SOLID
 from mpmopt.simulation.buffers import Memory
 from mpmopt.simulation.checkpoints import Checkpointing, Checkpoints, Schedule
-from mpmopt.simulation.indicators import WATCH, Indicators, Watched
-from mpmopt.simulation.simulation import Forward, Gradient, Simulation
-from mpmopt.validation import shown
+from mpmopt.simulation.energy import LOOK
+from mpmopt.simulation.indicators import WATCH, Indicators, Watched, wanted_steps
+from mpmopt.simulation.simulation import Forward, Gradient, Simulation, check_terminal_adjoints
 
 
 class LagrangianSimulation(Simulation):
@@ -79,7 +77,7 @@ class LagrangianSimulation(Simulation):
             stiffness=laid_out(of_particles(self.data.stiffness)),
             filled=np.any(there.reshape(columns * rows, -1), axis=1),
             actuated=actuated,
-            active=np.any(actuated.reshape(len(actuated), *shape), axis=(0, 2)),
+            active=np.any(actuated, axis=(0, 2)),
             actuation_stress=self.data.actuation_stress,
             mass=self._folded(mass, axis, int(rows)),
             ground=self.parameters.ground,
@@ -173,13 +171,7 @@ class LagrangianSimulation(Simulation):
 
     def run(self, frames: Sequence[int] | None = None) -> NDArray:
         """As `Simulation.run`."""
-        wanted = [self.scene.steps] if frames is None else list(frames)
-        whole = all(isinstance(frame, (int, np.integer)) for frame in wanted)
-        if not whole or [0, *wanted, self.steps] != sorted([0, *wanted, self.steps]):
-            raise DesignError(
-                f"frames must be whole numbers that increase from 0 to {self.steps}, got "
-                f"{shown(wanted)}"
-            )
+        wanted = self._wanted(frames)
         states = np.zeros((2, *self.start.shape), self.start.dtype)
         pushes = np.zeros((1, self.nodes), self.start.dtype)
         states[0] = self.start
@@ -209,19 +201,18 @@ class LagrangianSimulation(Simulation):
     def look(self, nodes: NDArray) -> Indicators:
         """Indicators of a state of the nodes: Courant number, smallest J of solid, and gap.
 
-        An isolated particle of four is unstable above a Courant number of 1, its c_p dt / (0.829 h)
-        in the state that it is in; blocks bear more. Solid cannot tear here, and no energy is
-        counted.
+        The Courant number is that of `Simulation`, of which a particle alone in its cell bears 0.9;
+        blocks bear more. Solid cannot tear here, and no energy is counted.
         """
-        records = kernels.grouped(self.particle_state(nodes))
-        courant, _, _, _ = kernels.indicators(
-            records, self.data, self.parameters, 0, len(self.data.mass)
-        )
-        F = kernels.parts(self.particle_state(nodes).real).deformation
+        state = self.particle_state(nodes)
+        records = kernels.grouped(state)
+        courant = self.indicators(records).courant
+        gap, gap_x, gap_y = self.gap(records)
+        F = kernels.parts(state.real).deformation
         J = F[0, 0] * F[1, 1] - F[0, 1] * F[1, 0]
         stiffness = kernels.ungrouped(self.data.stiffness.real, 1, len(J))[0]
-        solid = J[stiffness >= SOLID]
-        return Indicators(float(courant), 0.0, float(solid.min(initial=math.inf)), 0.0)
+        smallest = float(J[stiffness >= kernels.SOLID].min(initial=math.inf))
+        return Indicators(courant, jacobian=smallest, gap=gap, gap_x=gap_x, gap_y=gap_y)
 
     def checkpoints(self, wish: Checkpointing) -> Checkpoints:
         """As `Simulation.checkpoints`; what is stored are states of nodes and pushes of layers."""
@@ -244,7 +235,7 @@ class LagrangianSimulation(Simulation):
         """As `Simulation.forward`."""
         return LagrangianForward(self, checkpoints, memory or Memory(), instants)
 
-    @cached_property
+    @property
     def steps_per_call(self) -> int:
         """Steps that the kernels make before they return to Python."""
         return 1 + 1_000_000 // self.nodes
@@ -254,13 +245,7 @@ class _Watcher:
     """What is seen of a run: its indicators so far, and the states that were asked for."""
 
     def __init__(self, simulation: LagrangianSimulation, instants: Collection[int]) -> None:
-        steps = simulation.steps
-        for step in instants:
-            if not isinstance(step, (int, np.integer)) or not 0 <= step <= steps:
-                raise DesignError(
-                    f"instants must be whole numbers of steps from 0 to {steps}, got {shown(step)}"
-                )
-        self._wanted = {int(step) for step in (*instants, steps)}
+        self._wanted = wanted_steps(instants, simulation.steps)
         self._simulation = simulation
         self.states: dict[int, NDArray] = {}
         self.seen = Indicators()
@@ -272,13 +257,7 @@ class _Watcher:
             if step in self._wanted and step not in self.states:
                 self.states[step] = self._simulation.particle_state(nodes)
             if step % LOOK == 0 or step == self._simulation.steps:
-                gap = self._simulation.gap(kernels.grouped(self._simulation.particle_state(nodes)))
-                seen = self._simulation.look(nodes)
-                self.seen = self.seen.join(seen._replace(gap=gap[0], gap_x=gap[1], gap_y=gap[2]))
-
-
-# States are looked at once in so many steps.
-LOOK = 64
+                self.seen = self.seen.join(self._simulation.look(nodes))
 
 
 class LagrangianForward(Forward):
@@ -326,12 +305,7 @@ class LagrangianForward(Forward):
             raise DesignError("this run was gone back through already; run forward again")
         if self._shared.runs != self._run:
             raise DesignError("another run took this one's memory; give each run its own")
-        for step, terminal in terminal_adjoints.items():
-            if not 0 <= step <= steps or np.shape(terminal) != shape:
-                raise DesignError(
-                    f"terminal_adjoints has shape {np.shape(terminal)} at step {step}, must have "
-                    f"{shape} at steps from 0 to {steps}"
-                )
+        check_terminal_adjoints(terminal_adjoints, shape, steps)
         self._reversed = True
         dtype = simulation.start.dtype
 

@@ -164,14 +164,7 @@ class Simulation:
         SimulationError
             If a particle leaves the grid, inverts, or is not a number.
         """
-        wanted = [self.scene.steps] if frames is None else list(frames)
-        whole = all(isinstance(frame, (int, np.integer)) for frame in wanted)
-        ends = [0, *wanted, self.steps]
-        if not whole or ends != sorted(ends):
-            raise DesignError(
-                f"frames must be whole numbers that increase from 0 to {self.steps}, got "
-                f"{shown(wanted)}"
-            )
+        wanted = self._wanted(frames)
         memory = Segment(self, 1, Memory())
         states = memory.states
         states[0] = kernels.grouped(self.initial)
@@ -185,6 +178,18 @@ class Simulation:
                 step = last
             kept.append(kernels.ungrouped(states[0], *self.initial.shape))
         return kept[-1] if frames is None else np.array(kept)
+
+    def _wanted(self, frames: Sequence[int] | None) -> list[int]:
+        """Steps before the states that `run` gives, or a DesignError."""
+        wanted = [self.scene.steps] if frames is None else list(frames)
+        whole = all(isinstance(frame, (int, np.integer)) for frame in wanted)
+        ends = [0, *wanted, self.steps]
+        if not whole or ends != sorted(ends):
+            raise DesignError(
+                f"frames must be whole numbers that increase from 0 to {self.steps}, got "
+                f"{shown(wanted)}"
+            )
+        return wanted
 
     def states(self) -> Iterator[NDArray]:
         """The states (12, N) after 0, 1, ... steps, one after the other.
@@ -349,6 +354,18 @@ class Simulation:
         return Forward(self, checkpoints, segment, watcher)
 
 
+def check_terminal_adjoints(
+    terminal_adjoints: Mapping[int, NDArray[np.float64]], shape: tuple[int, ...], steps: int
+) -> None:
+    """Adjoints of states of a shape after so many steps, or a DesignError."""
+    for step, terminal in terminal_adjoints.items():
+        if not 0 <= step <= steps or np.shape(terminal) != shape:
+            raise DesignError(
+                f"terminal_adjoints has shape {np.shape(terminal)} at step {step}, must have "
+                f"{shape} at steps from 0 to {steps}"
+            )
+
+
 class Forward:
     """A forward run that is ready to be gone back through.
 
@@ -401,12 +418,7 @@ class Forward:
         simulation, memory = self._simulation, self._memory
         schedule = self._checkpoints.schedule
         shape, dtype = simulation.initial.shape, simulation.initial.dtype
-        for step, terminal in terminal_adjoints.items():
-            if not 0 <= step <= schedule.steps or np.shape(terminal) != shape:
-                raise DesignError(
-                    f"terminal_adjoints has shape {np.shape(terminal)} at step {step}, must have "
-                    f"{shape} at steps from 0 to {schedule.steps}"
-                )
+        check_terminal_adjoints(terminal_adjoints, shape, schedule.steps)
         self._reversed = True
 
         def seed_of(step: int) -> NDArray:
