@@ -10,9 +10,10 @@ from conftest import worst
 from walker import slanted_legs, walker
 
 from mpmopt import kernels
+from mpmopt.assess.forces import books
 from mpmopt.assess.verify import complex_step_test
 from mpmopt.design.problem import Problem
-from mpmopt.errors import SceneError
+from mpmopt.errors import DesignError, SceneError
 from mpmopt.kernels import lagrangian
 from mpmopt.scene import Actuator, Design, Grid, Material, Mirror, Scene, Solid, Wall
 from mpmopt.scene.ground import Ground
@@ -294,3 +295,11 @@ def test_what_the_formulation_cannot_do_is_said_with_the_cure(changes, says):
 def test_the_formulation_travels_as_json():
     scene = lattice_scene()
     assert Scene.from_json(scene.to_json()) == scene
+
+
+def test_states_one_after_the_other_are_those_of_a_run_and_have_no_books():
+    simulation = free_block(steps=3)
+    one_by_one = np.array(list(simulation.states()))
+    assert np.array_equal(one_by_one, simulation.run(range(4)))
+    with pytest.raises(DesignError, match='"total" has no transfer to keep books of; take the'):
+        books(simulation)

@@ -15,6 +15,7 @@ from scipy import sparse
 
 from mpmopt import kernels
 from mpmopt.assess.trajectory import with_image
+from mpmopt.errors import DesignError
 from mpmopt.scene import Scene
 from mpmopt.simulation.simulation import Simulation
 
@@ -120,9 +121,16 @@ def books(simulation: Simulation, progress: Callable[[], None] | None = None) ->
 
     Raises
     ------
+    DesignError
+        If the scene's formulation is not the one whose steps these are.
     SimulationError
         As `Simulation.run` does.
     """
+    if simulation.scene.formulation != "updated":
+        raise DesignError(
+            f'books: the formulation "{simulation.scene.formulation}" has no transfer to keep '
+            'books of; take the scene in "updated"'
+        )
     steps, scene, account = simulation.steps, simulation.scene, _Account(simulation)
     supports = tuple(f"ground {k}" for k in range(len(scene.layers)))
     supports += ("walls",) * bool(scene.walls)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -183,6 +183,17 @@ class LagrangianSimulation(Simulation):
             step = frame
             kept.append(self.particle_state(states[0]))
         return kept[-1] if frames is None else np.array(kept)
+
+    def states(self) -> Iterator[NDArray]:
+        """As `Simulation.states`."""
+        states = np.zeros((2, *self.start.shape), self.start.dtype)
+        pushes = np.zeros((1, self.nodes), self.start.dtype)
+        states[0] = self.start
+        yield self.particle_state(self.start)
+        for step in range(self.steps):
+            self._advance(states, pushes, step, step + 1, step)
+            states[0] = states[1]
+            yield self.particle_state(states[0])
 
     def watch(self, instants: Collection[int] = ()) -> Watched:
         """As `Simulation.watch`."""
