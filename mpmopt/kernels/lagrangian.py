@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from mpmopt.kernels.actuation import second_piola
-from mpmopt.kernels.compiler import jit, loop_jit
+from mpmopt.kernels.compiler import bare_jit, bare_loop_jit, jit, loop_jit
 from mpmopt.kernels.ground import (
     CREEPING,
     DAMPING,
@@ -105,7 +105,7 @@ class Rows(NamedTuple):
     stress: NDArray  # (fields, 2, n, MARGIN + width) by x and y, and place along x, of its particles
 
 
-@jit
+@bare_jit
 def width_of(lattice):
     """Numbers in a row of nodes: the last group's cells touch two nodes beyond it."""
     return 4 * lattice.groups + 4
@@ -122,7 +122,7 @@ def make_rows(fields, stressed, lattice):
     )
 
 
-@jit
+@bare_jit
 def across(nodes, first, b, scale, lattice, rows, field):
     """Sums of a field over the three rows of nodes of a row of cells, at b-th particles along y.
 
@@ -139,13 +139,13 @@ def across(nodes, first, b, scale, lattice, rows, field):
         put_four(rows.slopes, field * width + i, g0 * u0 + g1 * u1 + g2 * u2)
 
 
-@jit
+@bare_jit
 def along(sums, place, w0, w1, w2):
     """Sum over the three nodes along x of the cells of a group."""
     return w0 * four(sums, place) + w1 * four(sums, place + 1) + w2 * four(sums, place + 2)
 
 
-@jit
+@bare_jit
 def gradient(rows, field, i, a, lattice):
     """Gradient (00, 01, 10, 11) of a vector field at a-th particles along x of cells from i on."""
     w, width = lattice.weights, width_of(lattice)
@@ -159,17 +159,20 @@ def gradient(rows, field, i, a, lattice):
     )
 
 
-@jit
+@bare_jit
 def put_stress(rows, field, i, a, lattice, P):
     """Write what `gradient_adjoint` takes, of a-th particles along x of cells from i on."""
     n = len(lattice.weights)
     length = MARGIN + width_of(lattice)
     place = (2 * field * n + a) * length + MARGIN + i
-    for k in range(4):
-        put_four(rows.stress, place + k * n * length, P[k])
+    p00, p01, p10, p11 = P
+    put_four(rows.stress, place, p00)
+    put_four(rows.stress, place + n * length, p01)
+    put_four(rows.stress, place + 2 * n * length, p10)
+    put_four(rows.stress, place + 3 * n * length, p11)
 
 
-@jit
+@bare_jit
 def gradient_adjoint(rows, fields, b, scale, lattice, nodes, first):
     """Adds to the fields of nodes what `gradient` and `across` transposed give of the stresses.
 
@@ -194,7 +197,7 @@ def gradient_adjoint(rows, fields, b, scale, lattice, nodes, first):
             add_four(nodes, node + 2 * width, n2 * by_value + g2 * by_slope)
 
 
-@jit
+@bare_jit
 def continued(J):
     """ln J and its first and second derivative, continued below `LEAST_J`."""
     inside = above(J, LEAST_J)
@@ -206,7 +209,7 @@ def continued(J):
     return log + off * slope - 0.5 * off * off * bend, slope - off * bend, 0.0 * J - bend
 
 
-@jit
+@bare_jit
 def solid_stress(F, rate, constants, viscous):
     """First Piola-Kirchhoff stress P of the solid at F and its rate of change (00, 01, 10, 11).
 
@@ -227,7 +230,7 @@ def solid_stress(F, rate, constants, viscous):
     return p00, p01, p10, p11
 
 
-@jit
+@bare_jit
 def solid_stress_adjoint(F, rate, constants, viscous, P_bar):
     """F_bar and the adjoint of the rate from P_bar: the transpose of `solid_stress`."""
     f00, f01, f10, f11 = F
@@ -257,7 +260,7 @@ def solid_stress_adjoint(F, rate, constants, viscous, P_bar):
     return (b00, b01, b10, b11), (r00, r01, r10, r11)
 
 
-@jit
+@bare_jit
 def stress(rows, r, i, a, lattice, signal):
     """First Piola-Kirchhoff stress P of record r: a-th particles along x of cells from i on."""
     F = gradient(rows, 0, i, a, lattice)
@@ -276,7 +279,7 @@ def stress(rows, r, i, a, lattice, signal):
     return p00, p01, p10, p11
 
 
-@jit
+@bare_jit
 def stress_adjoint(rows, r, i, a, lattice, signal, bar, signal_bar):
     """F_bar and the adjoint of its rate from P_bar, the gradient of the rows' fields 4 and 5.
 
@@ -309,7 +312,7 @@ def stress_adjoint(rows, r, i, a, lattice, signal, bar, signal_bar):
     return F_bar, rate_bar
 
 
-@jit
+@bare_jit
 def forces(state, lattice, signal, rows, force):
     """Adds the internal force - sum V P G to the nodes' f_x and f_y."""
     n, M, width = len(lattice.weights), len(lattice.mass), width_of(lattice)
@@ -328,7 +331,7 @@ def forces(state, lattice, signal, rows, force):
             gradient_adjoint(rows, 2, b, -lattice.volume, lattice, force, j * width)
 
 
-@jit
+@bare_jit
 def forces_adjoint(state, force_bar, lattice, signal, rows, state_bar, bar, signal_bar):
     """From f_bar: adds to x_bar and v_bar of the nodes, to adjoints of stiffness and signal."""
     n, M, width = len(lattice.weights), len(lattice.mass), width_of(lattice)
@@ -354,7 +357,7 @@ def forces_adjoint(state, force_bar, lattice, signal, rows, state_bar, bar, sign
             gradient_adjoint(rows, fields, b, 1.0, lattice, state_bar, j * width)
 
 
-@jit
+@bare_jit
 def value(nodes, first, a, b, lattice):
     """A field of nodes at particles (a, b) of a group of cells, whose first node is at `first`."""
     w, width = lattice.weights, width_of(lattice)
@@ -366,7 +369,7 @@ def value(nodes, first, a, b, lattice):
     )
 
 
-@jit
+@bare_jit
 def value_adjoint(field, first, a, b, lattice, bar):
     """Adds to one field (M,) of nodes what the value `bar` at a particle gives them."""
     w, width = lattice.weights, width_of(lattice)
@@ -375,7 +378,7 @@ def value_adjoint(field, first, a, b, lattice, bar):
             field[first + row * width + k] += w[b, row] * w[a, k] * bar
 
 
-@jit
+@bare_jit
 def is_clear(x, y, lattice):
     """Whether a particle at (x, y) stays off the layers until it has moved by `SKIN` cells."""
     i, j = int(math.floor(x / lattice.dx + 0.5)), int(math.floor(y / lattice.dx + 0.5))
@@ -385,7 +388,7 @@ def is_clear(x, y, lattice):
     return lattice.ground.clearance[i * lattice.nodes_y + j] > (SKIN + 0.75) * lattice.dx
 
 
-@jit
+@bare_jit
 def find_near(state, lattice, near):
     """Which groups of cells (A B,) have a particle that the layers are near to."""
     n, M, width = len(lattice.weights), len(lattice.mass), width_of(lattice)
@@ -402,7 +405,7 @@ def find_near(state, lattice, near):
                             near[group] = True
 
 
-@jit
+@bare_jit
 def press(state, lattice, near, force):
     """Adds the layers' force b n and its size b to the nodes' f_x, f_y and f_N."""
     n, M, width = len(lattice.weights), len(lattice.mass), width_of(lattice)
@@ -430,7 +433,7 @@ def press(state, lattice, near, force):
                                     value_adjoint(force[2], at, a, b, lattice, size)
 
 
-@jit
+@bare_jit
 def press_adjoint(state, force_bar, lattice, near, state_bar, bar):
     """From the nodes' f_bar and f_N_bar: adds to x_bar and to stiffness_bar."""
     n, M, width = len(lattice.weights), len(lattice.mass), width_of(lattice)
@@ -469,7 +472,7 @@ def press_adjoint(state, force_bar, lattice, near, state_bar, bar):
                                     value_adjoint(state_bar[1], at, a, b, lattice, y_bar)
 
 
-@jit
+@bare_jit
 def contact_of(x, y, ground):
     """What `resistance` takes, of the ground that a node is the deepest in, and 1/d at a corner."""
     nearest, least = 0, math.inf
@@ -482,7 +485,7 @@ def contact_of(x, y, ground):
     return (nx, ny, layer[FRICTION], layer[DAMPING], layer[CREEPING]), bend
 
 
-@jit
+@bare_jit
 def fold(fields, lattice):
     """Add to nodes beside the mirror plane what the mirrored half puts there; its own transpose.
 
@@ -508,7 +511,7 @@ def steps_per_mass(lattice):
     return per_mass
 
 
-@jit
+@bare_jit
 def move(old, new, force, per_mass, lattice):
     """From a state and the forces on its nodes to the next; their fastest speed then, squared.
 
@@ -540,7 +543,7 @@ def move(old, new, force, per_mass, lattice):
     return max(max(fastest[0], fastest[1]), max(fastest[2], fastest[3]))
 
 
-@jit
+@bare_jit
 def before_resistance(u, v, push, contact):
     """The velocity that `resistance` made (u, v) of; along ground that sticks, none."""
     nx, ny, mu, alpha, creeping = contact
@@ -553,7 +556,7 @@ def before_resistance(u, v, push, contact):
     return nx * normal - ny * along, ny * normal + nx * along
 
 
-@jit
+@bare_jit
 def move_adjoint(old, new, force, per_mass, lattice, state_bar, force_bar, bar):
     """From the next state's adjoint to that of the state, but for what forces give, and to f_bar.
 
@@ -585,7 +588,7 @@ def move_adjoint(old, new, force, per_mass, lattice, state_bar, force_bar, bar):
         add_four(bar.mass, i, (-1.0 / dt) * per_m * (u * u_bar + v * v_bar))
 
 
-@jit
+@bare_jit
 def resist_adjoint(k, old, force, per_mass, lattice, state_bar, force_bar, bar):
     """The transpose of the resistance to node k, in place: velocity in `force`, its adjoint."""
     contact, bend = contact_of(old[0, k], old[1, k], lattice.ground)
@@ -617,8 +620,14 @@ def advance_lattice(
     Returns the step reached, and a node whose velocity is not a number then, or -1.
     """
     rows, force = make_rows(4, 2, lattice), np.zeros((3, len(lattice.mass)), states.dtype)
-    per_mass = steps_per_mass(lattice)
-    near, moved = np.zeros(len(lattice.filled), np.bool_), math.inf
+    near, per_mass = np.zeros(len(lattice.filled), np.bool_), steps_per_mass(lattice)
+    return steps(states, first, last, lattice, signal, rows, force, near, per_mass)
+
+
+@bare_loop_jit
+def steps(states, first, last, lattice, signal, rows, force, near, per_mass):
+    """What `advance_lattice` does, in the room that it makes."""
+    moved = math.inf
     for n in range(first, last):
         old, new = states[n % len(states)], states[(n + 1) % len(states)]
         force[:] = 0.0
@@ -637,7 +646,7 @@ def advance_lattice(
     return last, -1
 
 
-@jit
+@bare_jit
 def first_unsound(state):
     """The first node whose speed is infinite or not a number."""
     for i in range(state.shape[1]):
@@ -663,8 +672,20 @@ def advance_lattice_adjoint(
     """
     rows, force = make_rows(6, 4, lattice), np.zeros((3, len(lattice.mass)), states.dtype)
     force_bar = np.zeros_like(force)
-    per_mass = steps_per_mass(lattice)
-    near, moved = np.zeros(len(lattice.filled), np.bool_), math.inf
+    near, per_mass = np.zeros(len(lattice.filled), np.bool_), steps_per_mass(lattice)
+    steps_adjoint(
+        states, first, last, lattice, signal, rows, force, near, per_mass,
+        state_bar, force_bar, bar, signal_bar,
+    )  # fmt: skip
+
+
+@bare_loop_jit
+def steps_adjoint(
+    states, first, last, lattice, signal, rows, force, near, per_mass,
+    state_bar, force_bar, bar, signal_bar,
+):  # fmt: skip
+    """What `advance_lattice_adjoint` does, in the room that it makes."""
+    moved = math.inf
     for n in range(last - 1, first - 1, -1):
         old, new = states[n], states[n + 1]
         if len(lattice.ground.layers):
@@ -685,7 +706,7 @@ def advance_lattice_adjoint(
             press_adjoint(old, force_bar, lattice, near, state_bar, bar)
 
 
-@jit
+@bare_jit
 def fastest_of(state):
     """The speed of the fastest node."""
     M = state.shape[1]
