@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from mpmopt.kernels.actuation import second_piola
+from mpmopt.kernels.arrays import DEFORMATION, POSITION, STATE_SIZE, VELOCITY
 from mpmopt.kernels.compiler import bare_jit, bare_loop_jit, jit, loop_jit
 from mpmopt.kernels.ground import (
     CREEPING,
@@ -102,7 +103,7 @@ class Rows(NamedTuple):
 
     values: NDArray  # (fields, width) sums across the row, by the splines' values
     slopes: NDArray  # (fields, width) and by their slopes
-    stress: NDArray  # (fields, 2, n, MARGIN + width) by x and y, and place along x, of its particles
+    stress: NDArray  # (fields, 2, n, MARGIN + width) by x and y, of particles by place along x
 
 
 @bare_jit
@@ -170,6 +171,13 @@ def put_stress(rows, field, i, a, lattice, P):
     put_four(rows.stress, place + n * length, p01)
     put_four(rows.stress, place + 2 * n * length, p10)
     put_four(rows.stress, place + 3 * n * length, p11)
+
+
+@bare_jit
+def put_load(rows, field, i, a, lattice, load):
+    """Write what `value_adjoint` takes, of a-th particles along x of cells from i on."""
+    n, length = len(lattice.weights), MARGIN + width_of(lattice)
+    put_four(rows.stress, (2 * field * n + a) * length + MARGIN + i, load)
 
 
 @bare_jit
@@ -312,6 +320,44 @@ def stress_adjoint(rows, r, i, a, lattice, signal, bar, signal_bar):
     return F_bar, rate_bar
 
 
+@loop_jit
+def particles(nodes: NDArray, lattice: Any, number: NDArray[np.int64], state: NDArray) -> None:
+    """Fill in x, v and F of the particles, from the state (4, M) of the nodes.
+
+    `number` (V, 4) tells which particle of `state`, records (12 G, 4) of groups of four, each of
+    the lattice's is; -1: none.
+    """
+    to_particles(nodes, lattice, number, make_rows(4, 0, lattice), state)
+
+
+@bare_loop_jit
+def to_particles(nodes, lattice, number, rows, state):
+    """What `particles` does, in the room that it makes."""
+    n, M, width = len(lattice.weights), len(lattice.mass), width_of(lattice)
+    for j in range(lattice.rows):
+        for b in range(n):
+            for field in range(4):
+                across(nodes, field * M + j * width, b, 1.0, lattice, rows, field)
+            for a in range(n):
+                for g in range(lattice.groups):
+                    r = ((j * n + b) * n + a) * lattice.groups + g
+                    f00, f01, f10, f11 = gradient(rows, 0, 4 * g, a, lattice)
+                    x, y = value(rows, 0, 4 * g, a, lattice), value(rows, 1, 4 * g, a, lattice)
+                    u, v = value(rows, 2, 4 * g, a, lattice), value(rows, 3, 4 * g, a, lattice)
+                    for k in range(4):
+                        p = number[r, k]
+                        if p >= 0:
+                            record, lane = STATE_SIZE * (p // 4), p % 4
+                            state[record + POSITION, lane] = x[k]
+                            state[record + POSITION + 1, lane] = y[k]
+                            state[record + VELOCITY, lane] = u[k]
+                            state[record + VELOCITY + 1, lane] = v[k]
+                            state[record + DEFORMATION, lane] = f00[k]
+                            state[record + DEFORMATION + 1, lane] = f01[k]
+                            state[record + DEFORMATION + 2, lane] = f10[k]
+                            state[record + DEFORMATION + 3, lane] = f11[k]
+
+
 @bare_jit
 def forces(state, lattice, signal, rows, force):
     """Adds the internal force - sum V P G to the nodes' f_x and f_y."""
@@ -358,24 +404,30 @@ def forces_adjoint(state, force_bar, lattice, signal, rows, state_bar, bar, sign
 
 
 @bare_jit
-def value(nodes, first, a, b, lattice):
-    """A field of nodes at particles (a, b) of a group of cells, whose first node is at `first`."""
-    w, width = lattice.weights, width_of(lattice)
-    n0, n1, n2 = w[a, 0], w[a, 1], w[a, 2]
-    return (
-        w[b, 0] * along(nodes, first, n0, n1, n2)
-        + w[b, 1] * along(nodes, first + width, n0, n1, n2)
-        + w[b, 2] * along(nodes, first + 2 * width, n0, n1, n2)
-    )
+def value(rows, field, i, a, lattice):
+    """A field at a-th particles along x of cells from i on."""
+    w = lattice.weights
+    return along(rows.values, field * width_of(lattice) + i, w[a, 0], w[a, 1], w[a, 2])
 
 
 @bare_jit
-def value_adjoint(field, first, a, b, lattice, bar):
-    """Adds to one field (M,) of nodes what the value `bar` at a particle gives them."""
-    w, width = lattice.weights, width_of(lattice)
-    for row in range(3):
-        for k in range(3):
-            field[first + row * width + k] += w[b, row] * w[a, k] * bar
+def value_adjoint(rows, fields, b, lattice, nodes, first):
+    """Adds to the fields of nodes what `value` and `across` transposed give of the loads.
+
+    `first` is the place of the row's first node in `nodes`, of which each field has M.
+    """
+    width, w, n, M = width_of(lattice), lattice.weights, len(lattice.weights), len(lattice.mass)
+    length = MARGIN + width
+    for field in range(fields):
+        for i in range(0, width, 4):
+            by_value = nothing(rows.values)
+            for a in range(n):
+                x = (2 * field * n + a) * length + MARGIN + i
+                by_value = by_value + along(rows.stress, x - 2, w[a, 2], w[a, 1], w[a, 0])
+            node = field * M + first + i
+            add_four(nodes, node, w[b, 0] * by_value)
+            add_four(nodes, node + width, w[b, 1] * by_value)
+            add_four(nodes, node + 2 * width, w[b, 2] * by_value)
 
 
 @bare_jit
@@ -389,98 +441,127 @@ def is_clear(x, y, lattice):
 
 
 @bare_jit
-def find_near(state, lattice, near):
+def find_near(state, lattice, rows, near):
     """Which groups of cells (A B,) have a particle that the layers are near to."""
     n, M, width = len(lattice.weights), len(lattice.mass), width_of(lattice)
-    for group in range(len(near)):
-        near[group] = False
-        if lattice.filled[group]:
-            first = group // lattice.groups * width + 4 * (group % lattice.groups)
-            for b in range(n):
-                for a in range(n):
-                    x = real(value(state, first, a, b, lattice))
-                    y = real(value(state, M + first, a, b, lattice))
-                    for k in range(4):
-                        if not is_clear(x[k], y[k], lattice):
-                            near[group] = True
+    near[:] = False
+    for j in range(lattice.rows):
+        for b in range(n):
+            for field in range(2):
+                across(state, field * M + j * width, b, 1.0, lattice, rows, field)
+            for a in range(n):
+                for g in range(lattice.groups):
+                    group = j * lattice.groups + g
+                    if lattice.filled[group] and not near[group]:
+                        x = real(value(rows, 0, 4 * g, a, lattice))
+                        y = real(value(rows, 1, 4 * g, a, lattice))
+                        for k in range(4):
+                            near[group] = near[group] or not is_clear(x[k], y[k], lattice)
 
 
 @bare_jit
-def press(state, lattice, near, force):
+def is_near(near, j, lattice):
+    """Whether a layer is near to a row of cells."""
+    for g in range(j * lattice.groups, (j + 1) * lattice.groups):
+        if near[g]:
+            return True
+    return False
+
+
+@bare_jit
+def press(state, lattice, near, rows, force):
     """Adds the layers' force b n and its size b to the nodes' f_x, f_y and f_N."""
     n, M, width = len(lattice.weights), len(lattice.mass), width_of(lattice)
-    layers = lattice.ground.layers
-    for group in range(len(near)):
-        if near[group]:
-            j, g = group // lattice.groups, group % lattice.groups
-            first = j * width + 4 * g
+    for j in range(lattice.rows):
+        if is_near(near, j, lattice):
             for b in range(n):
+                for field in range(2):
+                    across(state, field * M + j * width, b, 1.0, lattice, rows, field)
                 for a in range(n):
-                    r = ((j * n + b) * n + a) * lattice.groups + g
-                    x = value(state, first, a, b, lattice)
-                    y = value(state, M + first, a, b, lattice)
-                    for k in range(4):
-                        capacity = lattice.volume * lattice.stiffness[r, k]
-                        if capacity.real > 0.0:
-                            for m in range(len(layers)):
-                                d, nx, ny, _ = distance(x[k], y[k], lattice.ground, m)
-                                thickness = layers[m, THICKNESS]
-                                if d.real < thickness:
-                                    size = bearing(d, thickness, layers[m, STIFFNESS] * capacity)
-                                    at = first + k
-                                    value_adjoint(force[0], at, a, b, lattice, size * nx)
-                                    value_adjoint(force[1], at, a, b, lattice, size * ny)
-                                    value_adjoint(force[2], at, a, b, lattice, size)
+                    for g in range(lattice.groups):
+                        for field in range(3):
+                            put_load(rows, field, 4 * g, a, lattice, nothing(rows.values))
+                        if near[j * lattice.groups + g]:
+                            r = ((j * n + b) * n + a) * lattice.groups + g
+                            bear(rows, r, 4 * g, a, lattice)
+                value_adjoint(rows, 3, b, lattice, force, j * width)
 
 
 @bare_jit
-def press_adjoint(state, force_bar, lattice, near, state_bar, bar):
+def bear(rows, r, i, a, lattice):
+    """The loads b n_x, b n_y, b of record r: a-th particles along x of cells from i on."""
+    layers = lattice.ground.layers
+    x, y = value(rows, 0, i, a, lattice), value(rows, 1, i, a, lattice)
+    for k in range(4):
+        capacity = lattice.volume * lattice.stiffness[r, k]
+        if capacity.real > 0.0:
+            for m in range(len(layers)):
+                d, nx, ny, _ = distance(x[k], y[k], lattice.ground, m)
+                thickness = layers[m, THICKNESS]
+                if d.real < thickness:
+                    size = bearing(d, thickness, layers[m, STIFFNESS] * capacity)
+                    at = MARGIN + i + k
+                    rows.stress[0, 0, a, at] += size * nx
+                    rows.stress[1, 0, a, at] += size * ny
+                    rows.stress[2, 0, a, at] += size
+
+
+@bare_jit
+def press_adjoint(state, force_bar, lattice, near, rows, state_bar, bar):
     """From the nodes' f_bar and f_N_bar: adds to x_bar and to stiffness_bar."""
     n, M, width = len(lattice.weights), len(lattice.mass), width_of(lattice)
-    layers = lattice.ground.layers
-    for group in range(len(near)):
-        if near[group]:
-            j, g = group // lattice.groups, group % lattice.groups
-            first = j * width + 4 * g
+    for j in range(lattice.rows):
+        if is_near(near, j, lattice):
             for b in range(n):
+                for field in range(2):
+                    across(state, field * M + j * width, b, 1.0, lattice, rows, field)
+                for field in range(3):
+                    first = field * M + j * width
+                    across(force_bar, first, b, 1.0, lattice, rows, 2 + field)
                 for a in range(n):
-                    r = ((j * n + b) * n + a) * lattice.groups + g
-                    x = value(state, first, a, b, lattice)
-                    y = value(state, M + first, a, b, lattice)
-                    qx = value(force_bar, first, a, b, lattice)
-                    qy = value(force_bar, M + first, a, b, lattice)
-                    qN = value(force_bar, 2 * M + first, a, b, lattice)
-                    for k in range(4):
-                        capacity = lattice.volume * lattice.stiffness[r, k]
-                        if capacity.real > 0.0:
-                            for m in range(len(layers)):
-                                d, nx, ny, bend = distance(x[k], y[k], lattice.ground, m)
-                                thickness = layers[m, THICKNESS]
-                                if d.real < thickness:
-                                    full = layers[m, STIFFNESS] * capacity
-                                    size = bearing(d, thickness, full)
-                                    size_bar = qN[k] + nx * qx[k] + ny * qy[k]
-                                    d_bar, full_bar = bearing_adjoint(d, thickness, full, size_bar)
-                                    x_bar, y_bar = distance_adjoint(
-                                        nx, ny, bend, d_bar, size * qx[k], size * qy[k]
-                                    )
-                                    bar.stiffness[r, k] += (
-                                        layers[m, STIFFNESS] * lattice.volume * full_bar
-                                    )
-                                    at = first + k
-                                    value_adjoint(state_bar[0], at, a, b, lattice, x_bar)
-                                    value_adjoint(state_bar[1], at, a, b, lattice, y_bar)
+                    for g in range(lattice.groups):
+                        for field in range(2):
+                            put_load(rows, field, 4 * g, a, lattice, nothing(rows.values))
+                        if near[j * lattice.groups + g]:
+                            r = ((j * n + b) * n + a) * lattice.groups + g
+                            bear_adjoint(rows, r, 4 * g, a, lattice, bar)
+                value_adjoint(rows, 2, b, lattice, state_bar, j * width)
+
+
+@bare_jit
+def bear_adjoint(rows, r, i, a, lattice, bar):
+    """The loads x_bar, y_bar of record r from f_bar and f_N_bar there; adds to stiffness_bar."""
+    layers = lattice.ground.layers
+    x, y = value(rows, 0, i, a, lattice), value(rows, 1, i, a, lattice)
+    qx, qy = value(rows, 2, i, a, lattice), value(rows, 3, i, a, lattice)
+    size_bar = value(rows, 4, i, a, lattice)
+    for k in range(4):
+        capacity = lattice.volume * lattice.stiffness[r, k]
+        if capacity > 0.0:
+            for m in range(len(layers)):
+                d, nx, ny, bend = distance(x[k], y[k], lattice.ground, m)
+                thickness = layers[m, THICKNESS]
+                if d < thickness:
+                    full = layers[m, STIFFNESS] * capacity
+                    size = bearing(d, thickness, full)
+                    b_bar = size_bar[k] + nx * qx[k] + ny * qy[k]
+                    d_bar, full_bar = bearing_adjoint(d, thickness, full, b_bar)
+                    x_bar, y_bar = distance_adjoint(nx, ny, bend, d_bar, size * qx[k], size * qy[k])
+                    bar.stiffness[r, k] += layers[m, STIFFNESS] * lattice.volume * full_bar
+                    at = MARGIN + i + k
+                    rows.stress[0, 0, a, at] += x_bar
+                    rows.stress[1, 0, a, at] += y_bar
 
 
 @bare_jit
 def contact_of(x, y, ground):
     """What `resistance` takes, of the ground that a node is the deepest in, and 1/d at a corner."""
-    nearest, least = 0, math.inf
-    for n in range(len(ground.layers)):
-        d, _, _, _ = distance(x, y, ground, n)
-        if d.real < least:
-            nearest, least = n, d.real
-    _, nx, ny, bend = distance(x, y, ground, nearest)
+    nearest = 0
+    d, nx, ny, bend = distance(x, y, ground, 0)
+    for n in range(1, len(ground.layers)):
+        closer, n_x, n_y, b = distance(x, y, ground, n)
+        if closer.real < d.real:
+            nearest, d, nx, ny, bend = n, closer, n_x, n_y, b
     layer = ground.layers[nearest]
     return (nx, ny, layer[FRICTION], layer[DAMPING], layer[CREEPING]), bend
 
@@ -619,7 +700,7 @@ def advance_lattice(
 
     Returns the step reached, and a node whose velocity is not a number then, or -1.
     """
-    rows, force = make_rows(4, 2, lattice), np.zeros((3, len(lattice.mass)), states.dtype)
+    rows, force = make_rows(4, 3, lattice), np.zeros((3, len(lattice.mass)), states.dtype)
     near, per_mass = np.zeros(len(lattice.filled), np.bool_), steps_per_mass(lattice)
     return steps(states, first, last, lattice, signal, rows, force, near, per_mass)
 
@@ -634,9 +715,9 @@ def steps(states, first, last, lattice, signal, rows, force, near, per_mass):
         forces(old, lattice, signal[n], rows, force)
         if len(lattice.ground.layers):
             if moved > SKIN * lattice.dx:
-                find_near(old, lattice, near)
+                find_near(old, lattice, rows, near)
                 moved = 0.0
-            press(old, lattice, near, force)
+            press(old, lattice, near, rows, force)
         if lattice.mirror_axis >= 0:
             fold(force, lattice)
         speed = move(old, new, force, per_mass, lattice)
@@ -690,11 +771,11 @@ def steps_adjoint(
         old, new = states[n], states[n + 1]
         if len(lattice.ground.layers):
             if moved > SKIN * lattice.dx:
-                find_near(old, lattice, near)
+                find_near(old, lattice, rows, near)
                 moved = 0.0
             force[:] = 0.0
             force_bar[2] = 0.0
-            press(old, lattice, near, force)
+            press(old, lattice, near, rows, force)
             if lattice.mirror_axis >= 0:
                 fold(force, lattice)
             moved += lattice.dt * fastest_of(old)
@@ -703,7 +784,7 @@ def steps_adjoint(
             fold(force_bar, lattice)
         forces_adjoint(old, force_bar, lattice, signal[n], rows, state_bar, bar, signal_bar[n])
         if len(lattice.ground.layers):
-            press_adjoint(old, force_bar, lattice, near, state_bar, bar)
+            press_adjoint(old, force_bar, lattice, near, rows, state_bar, bar)
 
 
 @bare_jit

@@ -44,6 +44,8 @@ class LagrangianSimulation(Simulation):
         line = (cell[:, 1] * per_cell + place[:, 1]) * per_cell + place[:, 0]
         self._slot = 4 * groups * line + cell[:, 0]
         records = rows * per_cell**2 * groups
+        self._number = np.full((records, 4), -1)
+        self._number.ravel()[self._slot] = np.arange(count)
 
         def laid_out(values: NDArray) -> NDArray:
             """Numbers (N,) of particles as records (V, 4) of the lattice, zero where none is."""
@@ -140,12 +142,14 @@ class LagrangianSimulation(Simulation):
 
     def particle_state(self, nodes: NDArray) -> NDArray:
         """The state (12, N) of the particles from that (4, M) of the nodes."""
-        N, Gx, Gy = self._weights
-        state = np.zeros(self.initial.shape, nodes.dtype)
-        x, v, _, F = kernels.parts(state)
-        x[:], v[:] = (N @ nodes[:2].T).T, (N @ nodes[2:].T).T
-        F[:, 0], F[:, 1] = (Gx @ nodes[:2].T).T, (Gy @ nodes[:2].T).T
-        return state
+        return kernels.ungrouped(self._records(nodes), *self.initial.shape)
+
+    def _records(self, nodes: NDArray) -> NDArray:
+        """The same as records of groups of particles, as `kernels.grouped` makes them."""
+        count = len(self._slot)
+        records = np.zeros((kernels.STATE_SIZE * -(-count // 4), 4), nodes.dtype)
+        lagrangian.particles(nodes, self.lattice, self._number, records)
+        return records
 
     def particle_state_adjoint(self, bar: NDArray) -> NDArray:
         """Adjoint (4, M) of the nodes' state from that of the particles' (12, N)."""
@@ -217,14 +221,12 @@ class LagrangianSimulation(Simulation):
         The Courant number is that of `Simulation`, of which a particle alone in its cell bears 0.9;
         blocks bear more. Solid cannot tear here, and no energy is counted.
         """
-        state = self.particle_state(nodes)
-        records = kernels.grouped(state)
+        records = self._records(nodes)
         courant = self.indicators(records).courant
         gap, gap_x, gap_y = self.gap(records)
-        F = kernels.parts(state.real).deformation
-        J = F[0, 0] * F[1, 1] - F[0, 1] * F[1, 0]
-        stiffness = kernels.ungrouped(self.data.stiffness.real, 1, len(J))[0]
-        smallest = float(J[stiffness >= kernels.SOLID].min(initial=math.inf))
+        f00, f01, f10, f11 = records.real.reshape(-1, kernels.STATE_SIZE, 4)[:, 8:].swapaxes(0, 1)
+        J = f00 * f11 - f01 * f10
+        smallest = float(J[self._solid].min(initial=math.inf))
         return Indicators(courant, jacobian=smallest, gap=gap, gap_x=gap_x, gap_y=gap_y)
 
     def checkpoints(self, wish: Checkpointing) -> Checkpoints:

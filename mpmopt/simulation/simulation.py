@@ -241,11 +241,21 @@ class Simulation:
 
     def gap(self, records: NDArray) -> tuple[float, float, float]:
         """How near solid that was far apart comes in a state, and where (`kernels.closest`)."""
-        solid = self.data.stiffness.real >= kernels.SOLID
-        solid &= self.data.mass.real > 0.0  # others only fill their group
-        reference = kernels.grouped(self.particles.position.T)
-        found = kernels.closest(records, reference, solid, self.data, self.parameters)
+        found = kernels.closest(
+            records, self._reference, self._solid, self.data, self.parameters
+        )
         return tuple(float(value) for value in found)  # type: ignore[return-value]
+
+    @cached_property
+    def _solid(self) -> NDArray[np.bool_]:
+        """Which particles (G, 4) have half the solid's stiffness or more."""
+        solid = self.data.stiffness.real >= kernels.SOLID
+        return solid & (self.data.mass.real > 0.0)  # others only fill their group
+
+    @cached_property
+    def _reference(self) -> NDArray[np.float64]:
+        """Records (2 G, 4) of the particles' places in the reference configuration."""
+        return kernels.grouped(self.particles.position.T)
 
     def parameters_of_steps(self, first: int, last: int) -> kernels.Parameters:
         """The surroundings, in which step `first` is number 0."""
