@@ -1,9 +1,9 @@
 """Total Lagrangian steps: a body on the lattice of its own reference configuration.
 
 Nodes are control points of quadratic B-splines, of which the cells are the spans; particles are
-quadrature points at fixed places in their cells, n x n in each. A step goes along the rows of cells,
-four neighbours at a time: of each cell the same particle. Sums over the nine nodes of a cell are
-taken across the row first, then along it.
+quadrature points at fixed places in their cells, n x n in each. A step goes along the rows of
+cells, four neighbours at a time: of each cell the same particle. Sums over the nine nodes of a cell
+are taken across the row first, then along it.
 
 A row of nodes has `width` numbers, one for each node and some that stand for none. Node i of row j
 has number j width + i; the nodes of cell (i, j) are (i, j) to (i + 2, j + 2). The state (4, M) of
@@ -358,7 +358,7 @@ def to_particles(nodes, lattice, number, rows, state):
                             state[record + DEFORMATION + 3, lane] = f11[k]
 
 
-@bare_jit
+@bare_loop_jit
 def forces(state, lattice, signal, rows, force):
     """Adds the internal force - sum V P G to the nodes' f_x and f_y."""
     n, M, width = len(lattice.weights), len(lattice.mass), width_of(lattice)
@@ -377,7 +377,7 @@ def forces(state, lattice, signal, rows, force):
             gradient_adjoint(rows, 2, b, -lattice.volume, lattice, force, j * width)
 
 
-@bare_jit
+@bare_loop_jit
 def forces_adjoint(state, force_bar, lattice, signal, rows, state_bar, bar, signal_bar):
     """From f_bar: adds to x_bar and v_bar of the nodes, to adjoints of stiffness and signal."""
     n, M, width = len(lattice.weights), len(lattice.mass), width_of(lattice)
@@ -433,14 +433,14 @@ def value_adjoint(rows, fields, b, lattice, nodes, first):
 @bare_jit
 def is_clear(x, y, lattice):
     """Whether a particle at (x, y) stays off the layers until it has moved by `SKIN` cells."""
-    i, j = int(math.floor(x / lattice.dx + 0.5)), int(math.floor(y / lattice.dx + 0.5))
+    i, j = math.floor(x / lattice.dx + 0.5), math.floor(y / lattice.dx + 0.5)
     if not (0 <= i < lattice.nodes_x and 0 <= j < lattice.nodes_y):
         return False
     # No distance from that node is more than 0.71 cells, and none changes by more than one goes.
     return lattice.ground.clearance[i * lattice.nodes_y + j] > (SKIN + 0.75) * lattice.dx
 
 
-@bare_jit
+@bare_loop_jit
 def find_near(state, lattice, rows, near):
     """Which groups of cells (A B,) have a particle that the layers are near to."""
     n, M, width = len(lattice.weights), len(lattice.mass), width_of(lattice)
@@ -462,13 +462,10 @@ def find_near(state, lattice, rows, near):
 @bare_jit
 def is_near(near, j, lattice):
     """Whether a layer is near to a row of cells."""
-    for g in range(j * lattice.groups, (j + 1) * lattice.groups):
-        if near[g]:
-            return True
-    return False
+    return np.any(near[j * lattice.groups : (j + 1) * lattice.groups])
 
 
-@bare_jit
+@bare_loop_jit
 def press(state, lattice, near, rows, force):
     """Adds the layers' force b n and its size b to the nodes' f_x, f_y and f_N."""
     n, M, width = len(lattice.weights), len(lattice.mass), width_of(lattice)
@@ -506,7 +503,7 @@ def bear(rows, r, i, a, lattice):
                     rows.stress[2, 0, a, at] += size
 
 
-@bare_jit
+@bare_loop_jit
 def press_adjoint(state, force_bar, lattice, near, rows, state_bar, bar):
     """From the nodes' f_bar and f_N_bar: adds to x_bar and to stiffness_bar."""
     n, M, width = len(lattice.weights), len(lattice.mass), width_of(lattice)
@@ -566,7 +563,7 @@ def contact_of(x, y, ground):
     return (nx, ny, layer[FRICTION], layer[DAMPING], layer[CREEPING]), bend
 
 
-@bare_jit
+@bare_loop_jit
 def fold(fields, lattice):
     """Add to nodes beside the mirror plane what the mirrored half puts there; its own transpose.
 
@@ -592,7 +589,7 @@ def steps_per_mass(lattice):
     return per_mass
 
 
-@bare_jit
+@bare_loop_jit
 def move(old, new, force, per_mass, lattice):
     """From a state and the forces on its nodes to the next; their fastest speed then, squared.
 
@@ -637,7 +634,7 @@ def before_resistance(u, v, push, contact):
     return nx * normal - ny * along, ny * normal + nx * along
 
 
-@bare_jit
+@bare_loop_jit
 def move_adjoint(old, new, force, per_mass, lattice, state_bar, force_bar, bar):
     """From the next state's adjoint to that of the state, but for what forces give, and to f_bar.
 
@@ -702,12 +699,6 @@ def advance_lattice(
     """
     rows, force = make_rows(4, 3, lattice), np.zeros((3, len(lattice.mass)), states.dtype)
     near, per_mass = np.zeros(len(lattice.filled), np.bool_), steps_per_mass(lattice)
-    return steps(states, first, last, lattice, signal, rows, force, near, per_mass)
-
-
-@bare_loop_jit
-def steps(states, first, last, lattice, signal, rows, force, near, per_mass):
-    """What `advance_lattice` does, in the room that it makes."""
     moved = math.inf
     for n in range(first, last):
         old, new = states[n % len(states)], states[(n + 1) % len(states)]
@@ -727,7 +718,7 @@ def steps(states, first, last, lattice, signal, rows, force, near, per_mass):
     return last, -1
 
 
-@bare_jit
+@bare_loop_jit
 def first_unsound(state):
     """The first node whose speed is infinite or not a number."""
     for i in range(state.shape[1]):
@@ -754,18 +745,6 @@ def advance_lattice_adjoint(
     rows, force = make_rows(6, 4, lattice), np.zeros((3, len(lattice.mass)), states.dtype)
     force_bar = np.zeros_like(force)
     near, per_mass = np.zeros(len(lattice.filled), np.bool_), steps_per_mass(lattice)
-    steps_adjoint(
-        states, first, last, lattice, signal, rows, force, near, per_mass,
-        state_bar, force_bar, bar, signal_bar,
-    )  # fmt: skip
-
-
-@bare_loop_jit
-def steps_adjoint(
-    states, first, last, lattice, signal, rows, force, near, per_mass,
-    state_bar, force_bar, bar, signal_bar,
-):  # fmt: skip
-    """What `advance_lattice_adjoint` does, in the room that it makes."""
     moved = math.inf
     for n in range(last - 1, first - 1, -1):
         old, new = states[n], states[n + 1]
@@ -787,7 +766,7 @@ def steps_adjoint(
             press_adjoint(old, force_bar, lattice, near, rows, state_bar, bar)
 
 
-@bare_jit
+@bare_loop_jit
 def fastest_of(state):
     """The speed of the fastest node."""
     M = state.shape[1]

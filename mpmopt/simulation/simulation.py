@@ -241,9 +241,7 @@ class Simulation:
 
     def gap(self, records: NDArray) -> tuple[float, float, float]:
         """How near solid that was far apart comes in a state, and where (`kernels.closest`)."""
-        found = kernels.closest(
-            records, self._reference, self._solid, self.data, self.parameters
-        )
+        found = kernels.closest(records, self._reference, self._solid, self.data, self.parameters)
         return tuple(float(value) for value in found)  # type: ignore[return-value]
 
     @cached_property
