@@ -11,12 +11,13 @@ from conftest import small_scene
 from mpmopt.design.problem import Problem
 from mpmopt.design.task import AtMost, Task
 from mpmopt.design.terms import Effort, OnePiece, Speed, Volume
+from mpmopt.design.variation import Variation
 from mpmopt.optimisation.history import Candidate, Iteration, Optimisation, StageState
 from mpmopt.optimisation.loop import begin
 from mpmopt.optimisation.mma import MovingAsymptotes
 from mpmopt.optimisation.settings import Settings, Stage
 from mpmopt.results import runfile
-from mpmopt.scene import Material, Mirror, Scene, Wall
+from mpmopt.scene import Ground, Material, Mirror, Scene, Wall
 
 numbers = itertools.count(2)
 
@@ -80,7 +81,11 @@ def run():
         Optimisation,
         scene=small_scene(),
         settings=settings,
-        task=Task(Speed(0.01) - 0.5 * Effort(), (AtMost(Volume(), 0.5), AtMost(OnePiece(), 1.0))),
+        task=Task(
+            Speed(0.01) - 0.5 * Effort(),
+            (AtMost(Volume(), 0.5), AtMost(OnePiece(), 1.0)),
+            2 * (Variation(friction=0.2, ground=(Ground.floor(0.1),)),),
+        ),
         x=np.array([0.5, -0.25]),
         stage=1,
         gave_up=True,

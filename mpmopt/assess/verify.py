@@ -522,7 +522,9 @@ def _settled(problem: Problem, x: NDArray[np.float64]) -> tuple[Problem, NDArray
         )
     evaluation = problem.evaluate(x)
     problem = problem.at(evaluation.time_step)
-    problem.halvings, problem.limits = 0, None
+    problem.halvings = 0
+    for each in (problem, *problem.members):
+        each.limits = None
     return problem, evaluation.gradients
 
 
@@ -563,19 +565,29 @@ def _complex_steps(
 
 def _derivatives(problem: Problem, x: NDArray[np.complex128]) -> tuple[NDArray, NDArray]:
     """Those of all terms (1 + m,) by the complex step, and the size of what each is a sum of."""
+    pairs = [_terms(member, x) for member in problem.members or (problem,)]
+    values, size = (np.array(part) for part in zip(*pairs))  # (S, 1 + m) each
+    value, weights = problem.task.soft(values[:, 0])
+    worst = values[:, 1:].real.argmax(axis=0), np.arange(1, values.shape[1])
+    exact = np.array([value, *values[worst]]).imag / COMPLEX_STEP
+    return exact, np.array([weights.real @ size[:, 0], *size[worst]])
+
+
+def _terms(problem: Problem, x: NDArray[np.complex128]) -> tuple[list[complex], list[float]]:
+    """Values of all terms in one scene, and the size of what the derivative of each is a sum of."""
     simulation = problem.simulation(x)
     states = simulation.watch(problem.task.instants(problem.scene)).states
     outcome = Outcome(simulation, problem.gamma(x), states)
     real_states = {step: state.real for step, state in states.items()}
     real = Outcome(problem.simulation(x.real), outcome.gamma.real, real_states)
-    exact, size = [], []
+    values, size = [], []
     for term in problem.task.terms:
         bars = term.adjoints(real)
         parts = [bar * states[step].imag for step, bar in bars.states.items()]
         parts += [bars.gamma * outcome.gamma.imag, bars.signal * simulation.signal.imag]
-        exact.append(np.imag(term.value(outcome)) / COMPLEX_STEP)
+        values.append(term.value(outcome))
         size.append(math.hypot(*(float(np.linalg.norm(part)) for part in parts)) / COMPLEX_STEP)
-    return np.array(exact), np.array(size)
+    return values, size
 
 
 class Taylor(NamedTuple):
