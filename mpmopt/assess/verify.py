@@ -121,7 +121,11 @@ def kernel_mismatches(scene: Scene, seed: int = 0) -> dict[str, float]:
             bench.grid_update_adjoint,
             "grid" + " normal_force" * bool(scene.ground),
         ),
-        "g2p": (bench.g2p, bench.g2p_adjoint, "position node_velocity"),
+        "g2p": (
+            bench.g2p,
+            bench.g2p_adjoint,
+            "position velocity affine_velocity node_velocity",
+        ),
     }
     if scene.ground:
         tests["press"] = bench.press, bench.press_adjoint, "position stiffness"
@@ -421,8 +425,8 @@ class _Bench:
         old, cells = self._before_g2p(v)
         bar, tile, cells_bar = self._bar(**w), self._tile(old), np.zeros_like(cells)
         kernels.g2p_adjoint(self.parameters, tile, cells, cells_bar, bar, *self.all)
-        node_velocity = self._nodes(cells_bar).reshape(-1, 2)
-        return {"position": self._parts(bar).position, "node_velocity": node_velocity}
+        found = {name: getattr(self._parts(bar), name) for name in v if name != "node_velocity"}
+        return {**found, "node_velocity": self._nodes(cells_bar).reshape(-1, 2)}
 
 
 def _log_jacobian(records: NDArray) -> NDArray:
