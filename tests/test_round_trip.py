@@ -146,7 +146,7 @@ def test_every_field_of_a_scene_comes_back_from_its_text():
         time_step=5e-4, gravity=(0.0, -3.0),
         walls=(Wall("y", 4 * c, friction=0.25), Wall("x", 13 * c, "above")),
         direction=(0.6, 0.8), particles_per_cell=4, filter_weights=(0.5, 0.1, 0.025),
-        filter_length=0.125, transient=8e-3, blend_time=1e-3,
+        filter_length=0.125, transient=8e-3,
     )  # fmt: skip
     defaults = {
         field.name for field in dataclasses.fields(Scene)
