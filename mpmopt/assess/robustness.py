@@ -42,6 +42,8 @@ ROOM = 12.0
 # It has fallen when it leans by this angle, or is nearer to the ground than this share of its first
 # distance; it has stopped when it goes less than this share of its speed for so long.
 LEANS, LOW, SLOW, PAUSE = math.radians(45.0), 0.5, 0.1, 2.0
+# Speeds of less than this share of the body's longer side per unit of time have no shares.
+LEAST = 2e-3
 # Particles times steps of one run: what takes minutes is left out, in the short study and in the full.
 MOST_WORK, MOST_WORK_FULL = 3e8, 5e9
 
@@ -326,8 +328,8 @@ def study(
     -------
     dict
         ``speed``; ``speed_by_friction``, and where it is full ``speed_by_strength``,
-        ``speed_by_frequency``, ``speed_by_cells`` of both formulations and ``speed_by_step``, by
-        numbers as text; ``kept``, shares of the speed with half the step, on finer cells, and where
+        ``speed_by_frequency``, ``speed_by_step`` (times the run's) and ``speed_by_cells`` (along the
+        grid's shorter side) of both formulations, by numbers as text; ``kept``, shares of the speed with half the step, on finer cells, and where
         it is full on the finest and in the other formulation (on the finer cells);
         ``driven_share``, what is missing when the actuation is held; ``after_push``, the share of
         the speed that it has after a push; ``followed``, how long it goes on and what ends it;
@@ -348,7 +350,7 @@ def study(
 
     def share(name: str) -> float | None:
         value = speeds[name]
-        if value is None or nominal is None or not nominal > 0.0:
+        if value is None or nominal is None or not nominal > LEAST * max(scene.extent):
             return None
         return value / nominal
 
@@ -366,7 +368,7 @@ def study(
     }
     if full:
         kept |= {"finest_cells": share("cells 4"), "other_formulation": share("other 2")}
-        count = scene.grid.cells[0]
+        count = min(scene.grid.cells)
         found |= {
             "after_push": share("pushed"),
             "speed_by_strength": table("strength"),
