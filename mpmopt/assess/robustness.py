@@ -1,4 +1,4 @@
-"""Does a finished robot go on: elsewhere, in other discretisations, when it is pushed, and for long?
+"""Does a finished robot go on: elsewhere, in other discretisations, when pushed, and for long?
 
 A robot is what would be built: without grey and void, and without what hangs on nothing.
 """
@@ -21,11 +21,11 @@ from mpmopt.assess.threshold import SOLID_LIMITS, solid_body
 from mpmopt.design.objective import Objective
 from mpmopt.design.problem import Problem, Variables
 from mpmopt.design.step_control import check_indicators
-from mpmopt.errors import DesignError, SceneError, SimulationError
+from mpmopt.errors import SceneError, SimulationError
 from mpmopt.kernels import parts
 from mpmopt.scene import Grid, Scene
 from mpmopt.scene.particles import Particles, discretise, mirror_images, nearest_designed
-from mpmopt.scene.scene import LAGRANGIAN_LIMIT
+from mpmopt.scene.scene import LAGRANGIAN_LIMIT, Formulation
 from mpmopt.simulation.simulation import Simulation
 from mpmopt.simulation.threads import threads
 
@@ -44,7 +44,12 @@ ROOM = 12.0
 LEANS, LOW, SLOW, PAUSE = math.radians(45.0), 0.5, 0.1, 2.0
 # Speeds of less than this share of the body's longer side per unit of time have no shares.
 LEAST = 2e-3
-# Particles times steps of one run: what takes minutes is left out, in the short study and in the full.
+# What `study` tells, of what there is.
+NAMES = (
+    "speed", "speed_by_friction", "kept", "driven_share", "after_push", "speed_by_strength",
+    "speed_by_frequency", "speed_by_step", "speed_by_cells", "followed", "components",
+)  # fmt: skip
+# Particles times steps of one run, in the short study and in the full: longer ones are left out.
 MOST_WORK, MOST_WORK_FULL = 3e8, 5e9
 
 
@@ -109,7 +114,7 @@ def lasting(scene: Scene, seconds: float) -> Scene:
     return replace(scene, grid=grid, steps=steps, transient=0.0)
 
 
-def refined(scene: Scene, multiple: float = 1.0, formulation: str | None = None) -> Scene:
+def refined(scene: Scene, multiple: float = 1.0, formulation: Formulation | None = None) -> Scene:
     """The scene with so many times its cells along each axis, and in another formulation.
 
     The step is as much shorter as cells are narrower, and shorter still where viscosity or a layer
@@ -137,7 +142,7 @@ def refined(scene: Scene, multiple: float = 1.0, formulation: str | None = None)
     )
 
 
-def other_formulation(scene: Scene) -> str:
+def other_formulation(scene: Scene) -> Formulation:
     """The one that the scene is not in."""
     return "updated" if scene.formulation == "total" else "total"
 
@@ -242,10 +247,11 @@ def follow(robot: Robot, scene: Scene) -> Followed:
     if scene.mirror is None:  # of half a body both sides may lean
         fallen |= np.abs(angle) > LEANS
     time = time[: len(way)]
-    seen = (time >= SETTLED) & (time <= SEEN)
-    mean = np.ptp(way[seen][[0, -1]]) / np.ptp(time[seen]) if seen.sum() > 1 else 0.0
+    seen = np.flatnonzero((time >= SETTLED) & (time <= SEEN))
+    first, last = (seen[0], seen[-1]) if seen.size > 1 else (0, -1)
+    mean = max(float(way[last] - way[first]) / float(np.ptp(time[[first, last]]) or 1.0), 0.0)
     pause = round(PAUSE / (every * scene.time_step))
-    slow = way[pause:] - way[:-pause] < SLOW * mean * PAUSE if len(way) > pause else np.zeros(0)
+    slow = way[pause:] - way[: len(way) - pause] <= SLOW * mean * PAUSE
     events = [(float(time[fallen.argmax()]), "falls")] if fallen.any() else []
     late = np.flatnonzero(slow & (time[: len(slow)] >= SETTLED))
     if late.size:
@@ -328,13 +334,14 @@ def study(
     -------
     dict
         ``speed``; ``speed_by_friction``, and where it is full ``speed_by_strength``,
-        ``speed_by_frequency``, ``speed_by_step`` (times the run's) and ``speed_by_cells`` (along the
-        grid's shorter side) of both formulations, by numbers as text; ``kept``, shares of the speed with half the step, on finer cells, and where
-        it is full on the finest and in the other formulation (on the finer cells);
-        ``driven_share``, what is missing when the actuation is held; ``after_push``, the share of
-        the speed that it has after a push; ``followed``, how long it goes on and what ends it;
-        ``components``, before loose pieces are dropped; and ``failures``, why a number is None.
-        Only the components where there is no ground or no actuator.
+        ``speed_by_frequency``, ``speed_by_step`` (times the run's) and, of both formulations,
+        ``speed_by_cells`` (along the grid's shorter side), by numbers as text; ``kept``, shares of
+        the speed with half the step, with cells half as wide, and where it is full a quarter as
+        wide, and half as wide in the other formulation; ``driven_share``, what is missing when the
+        actuation is held; ``after_push``, the share of the speed that it has after a push;
+        ``followed``, how long it goes on and what ends it; ``components``, before loose pieces are
+        dropped; and ``failures``, why a number is None. Only the components where there is no
+        ground or no actuator.
 
     Raises
     ------
@@ -347,6 +354,8 @@ def study(
         return found
     speeds, failures = _speeds(robot, _trials(scene, full), full, progress)
     nominal = speeds["nominal"]
+    for kind in ("cells", "step", "strength", "frequency"):
+        speeds[f"{kind} 1"] = nominal
 
     def share(name: str) -> float | None:
         value = speeds[name]
@@ -356,7 +365,8 @@ def study(
 
     def table(kind: str) -> dict[str, float | None]:
         names = (name.split() for name in speeds)
-        return {words[1]: speeds[" ".join(words)] for words in names if words[0] == kind}
+        numbers = sorted((words[1] for words in names if words[0] == kind), key=float)
+        return {number: speeds[f"{kind} {number}"] for number in numbers}
 
     kept = {"half_step": share("step 0.5"), "finer_cells": share("cells 2")}
     still = share("frozen")
@@ -373,13 +383,13 @@ def study(
             "after_push": share("pushed"),
             "speed_by_strength": table("strength"),
             "speed_by_frequency": table("frequency"),
-            "speed_by_step": {"1": nominal, **table("step")},
+            "speed_by_step": table("step"),
             "speed_by_cells": {
                 formulation: {
                     f"{float(multiple) * count:g}": value for multiple, value in of_cells.items()
                 }
                 for formulation, of_cells in (
-                    (scene.formulation, {"1": nominal, **table("cells")}),
+                    (scene.formulation, table("cells")),
                     (other_formulation(scene), table("other")),
                 )
             },
@@ -392,7 +402,7 @@ def _trials(scene: Scene, full: bool) -> dict[str, Trial]:
     """The runs of a study, the longest first; names are a kind and a number."""
     other = other_formulation(scene)
 
-    def cells(multiple: float, formulation: str | None = None) -> Trial:
+    def cells(multiple: float, formulation: Formulation | None = None) -> Trial:
         return Trial(lambda: refined(scene, multiple, formulation))
 
     def steps(multiple: float) -> Trial:
@@ -438,7 +448,9 @@ def _speeds(
             name = runs[done]
             try:
                 speeds[name] = done.result()
-            except (DesignError, SceneError, SimulationError) as error:
+            except SimulationError as error:
+                failures[name] = error.what
+            except SceneError as error:
                 failures[name] = str(error)
             if progress is not None:
                 progress(name, math.nan if speeds[name] is None else float(speeds[name] or 0.0))

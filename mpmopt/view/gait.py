@@ -245,8 +245,7 @@ def plot_robustness(path: str | os.PathLike[str], summary: Mapping[str, Any]) ->
         for k, (name, text) in enumerate(
             (("step", "time step"), ("strength", "actuators' strength"), ("frequency", "frequency"))
         ):
-            values = {"1": nominal, **summary[f"speed_by_{name}"]}
-            _curve(panels[3], values, f"C{k}", text)
+            _curve(panels[3], summary[f"speed_by_{name}"], f"C{k}", text)
         panels[3].set_xlabel("times that of the run")
         for axes in panels[2:]:
             axes.legend(fontsize=8, frameon=False)
