@@ -136,6 +136,7 @@ def study(path: Path) -> int:
     from mpmopt.app.study import full_study
     from mpmopt.assess.refinement import VARIANTS, Variant
     from mpmopt.assess.refinement import study as refined
+    from mpmopt.assess.robustness import can_be_studied
     from mpmopt.io.progress import Progress
     from mpmopt.validation import digits
 
@@ -159,7 +160,8 @@ def study(path: Path) -> int:
             "gain retained"
         )
         refined(run.problem(), run.result.x, progress=show)
-    print(full_study(path))
+    if can_be_studied(run.scene):
+        print(full_study(path))
     return 0
 
 
