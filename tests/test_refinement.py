@@ -92,7 +92,7 @@ def test_no_share_of_a_gain_that_is_rounding(tmp_path, capsys):
     x = Problem(scene).join(np.empty(0), 0.2, 0.1, 0.1)
     path = tmp_path / "run.h5"
     runfile.write(path, optimise(scene, SHORT, x))
-    for name in ("postprocess", "refine"):
+    for name in ("postprocess", "study"):
         assert main([name, str(path)]) == 0
         said = capsys.readouterr()
         assert "nan" not in said.out + said.err

@@ -125,7 +125,7 @@ def test_loose_particles_are_those_that_hang_on_nothing(told):
 
 
 def test_a_case_starts_where_it_says(tmp_path, monkeypatch):
-    monkeypatch.setattr(case, "_go_on", lambda path, kept, checkpointing: kept.run.x)
+    monkeypatch.setattr(case, "_go_on", lambda path, kept, *_: kept.run.x)
     start = {"theta": (0.9, -0.75), "a": 0.5, "b": 0.25}
     study = Case(SCENE, SHORT, lambda position: position[:, 0] > 0.0, start)
     x: Any = case.run(study, tmp_path / "one")
@@ -135,7 +135,7 @@ def test_a_case_starts_where_it_says(tmp_path, monkeypatch):
 
 
 def test_a_baseline_is_kept_for_each_coarsening_of_the_stages(tmp_path, monkeypatch):
-    monkeypatch.setattr(case, "_go_on", lambda path, kept, checkpointing: kept.baseline)
+    monkeypatch.setattr(case, "_go_on", lambda path, kept, *_: kept.baseline)
     stages = (dataclasses.replace(STAGE, coarsening=2, time_step=4e-3, solid=False), STAGE)
     twice: list[dict[str, Any]] = [
         {name: tuple(2 * k for k in getattr(part, name)) for name in ("lower", "upper")}

@@ -167,7 +167,7 @@ def test_what_is_printed_of_a_small_robot_has_digits(tmp_path, capsys):
     are_told(re.findall(r"best L = (\S+)", repr(kept))[0], 1)
     assert commands.main(["postprocess", str(tmp_path / "run.h5")]) == 0
     are_told("\n".join(line.split("(gamma")[0] for line in capsys.readouterr().out.split("\n")), 3)
-    assert commands.main(["refine", str(tmp_path / "run.h5")]) == 0
+    assert commands.main(["study", str(tmp_path / "run.h5")]) == 0
     _, *lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 4
     for line in lines:
