@@ -13,6 +13,7 @@ from numpy.typing import DTypeLike, NDArray
 from mpmopt import kernels
 from mpmopt.errors import DesignError, SimulationError
 from mpmopt.kernels import lagrangian
+from mpmopt.scene.parts import Vector
 from mpmopt.simulation.buffers import Memory
 from mpmopt.simulation.checkpoints import Checkpointing, Checkpoints, Schedule
 from mpmopt.simulation.energy import LOOK
@@ -180,17 +181,28 @@ class LagrangianSimulation(Simulation):
 
     def run(self, frames: Sequence[int] | None = None) -> NDArray:
         """As `Simulation.run`."""
-        wanted = self._wanted(frames)
+        kept = [self.particle_state(nodes) for nodes in self._nodes_at(self._wanted(frames))]
+        return kept[-1] if frames is None else np.array(kept)
+
+    def _nodes_at(self, wanted: list[int]) -> Iterator[NDArray]:
+        """States (M, 4) of the nodes after so many steps each, to be used at once."""
         states = np.zeros((2, *self.start.shape), self.start.dtype)
         states[0] = self.start
-        kept, step = [], 0
+        step = 0
         for frame in wanted:
             self._advance(states, step, frame, step)
             if (frame - step) % 2:
                 states[0] = states[1]
             step = frame
-            kept.append(self.particle_state(states[0]))
-        return kept[-1] if frames is None else np.array(kept)
+            yield states[0]
+
+    def pushed(self, step: int, velocity: Vector) -> LagrangianSimulation:
+        """As `Simulation.pushed`."""
+        (nodes,) = self._nodes_at([step])
+        other = self._from(step)
+        other.start = nodes.copy()
+        other.start[:, 2:] += velocity
+        return other
 
     def states(self) -> Iterator[NDArray]:
         """As `Simulation.states`."""
