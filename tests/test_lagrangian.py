@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -197,6 +198,75 @@ def test_a_free_body_keeps_its_momenta():
     assert np.abs(linear - linear[0]).max() <= 1e-13 * np.abs(linear[0]).max()
     assert np.abs(angular - angular[0]).max() <= 1e-12 * np.abs(angular[0])
     assert np.abs(v - v[0]).max() > 0.1
+
+
+def test_cells_are_asked_anew_when_nodes_may_have_come_near(rng):
+    # What all steps in one call give is what single steps do, each of which asks all cells.
+    scene = lattice_scene(ground=(Ground(((0.0, C), (1.0, C)), friction=0.4, thickness=C),))
+    particles = discretise(scene)
+    simulation = LagrangianSimulation(scene, particles, *material_of(particles), np.zeros((60, 2)))
+    lattice, signal = simulation.lattice, simulation.signal
+    states = np.zeros((61, *simulation.start.shape))
+    states[0] = simulation.start
+    states[0, 3] = np.where(lattice.mass > 0.0, -3.0, 0.0)
+    by_one = states.copy()
+    lagrangian.advance_lattice(states, 0, 60, lattice, signal)
+    for n in range(60):
+        lagrangian.advance_lattice(by_one, n, n + 1, lattice, signal)
+    assert states[..., 3, :].min() < -2.9
+    assert states[..., 3, :].max() > 0.5  # it bounces
+    assert np.array_equal(states, by_one)
+    found = []
+    terminal = rng.standard_normal(simulation.start.shape)
+    for cuts in ([0, 60], range(61)):
+        bar, signal_bar = lagrangian.LatticeBar.zeros(lattice), np.zeros_like(signal)
+        state_bar = np.where(lattice.mass > 0.0, terminal, 0.0)
+        for first, last in reversed([*pairwise(cuts)]):
+            lagrangian.advance_lattice_adjoint(
+                states, first, last, lattice, signal, state_bar, bar, signal_bar
+            )
+        found.append(np.concatenate([state_bar.ravel(), bar.mass, bar.stiffness.ravel()]))
+    assert np.array_equal(*found)
+
+
+def energy(simulation, nodes):
+    """Kinetic and stored energy of a state of the nodes, whose velocities are half a step old."""
+    scene, lattice = simulation.scene, simulation.lattice
+    x, v = nodes[:2], nodes[2:]
+    F = kernels.parts(simulation.particle_state(np.concatenate([x - 0.5 * lattice.dt * v, v])))
+    F = F.deformation
+    log = np.log(F[0, 0] * F[1, 1] - F[0, 1] * F[1, 0])
+    material = scene.material
+    stored = material.lame_mu / 2.0 * ((F**2).sum(axis=(0, 1)) - 2.0 - 2.0 * log)
+    stored += material.lame_lambda / 2.0 * log**2
+    return (lattice.mass * (v**2).sum(axis=0)).sum() / 2.0, lattice.volume * stored.sum()
+
+
+@pytest.mark.parametrize("steps", [3000, pytest.param(100_000, marks=pytest.mark.slow)])
+def test_the_energy_of_a_vibrating_bar_does_not_drift(steps):
+    scene = lattice_scene(
+        ground=(), gravity=(0.0, 0.0), material=Material(), steps=steps, time_step=2e-3,
+        body=(Solid((3 * C, 5 * C), (13 * C, 7 * C)),),
+    )  # fmt: skip
+    particles = discretise(scene)
+    simulation = LagrangianSimulation(
+        scene, particles, *material_of(particles), np.zeros((steps, 0))
+    )
+    state = np.zeros((2, *simulation.start.shape))
+    state[0] = simulation.start
+    there = simulation.lattice.mass > 0.0
+    x = simulation.start[0] - 0.5
+    state[0, 3] = np.where(there, 0.3 * (12.0 * x**2 - 0.33), 0.0)  # it bends
+    found = []
+    for _ in range(steps // 50):
+        found.append(energy(simulation, state[0]))
+        simulation._advance(state, 0, 50, 0)
+    kinetic, stored = np.array(found).T
+    total = kinetic + stored
+    share = len(total) // 5
+    assert stored.max() > 0.8 * total[0]
+    assert np.ptp(total) <= 2e-3 * total[0]
+    assert total[-share:].mean() == pytest.approx(total[:share].mean(), rel=1e-4)
 
 
 def test_void_may_invert_and_the_gradient_stays_exact(rng):

@@ -170,6 +170,20 @@ def test_the_vortex_is_right_at_a_tenth_and_inverts_at_one():
             inversion.vortex(1.0, cells)
 
 
+def test_the_total_lagrangian_vortex_is_right_where_it_is_stretched_seven_times():
+    assert inversion.vortex_stretch(1.0) > 7.0
+    assert inversion.total_vortex(1.0, 48, 0.2) <= 0.03
+
+
+@pytest.mark.slow
+def test_the_total_lagrangian_vortex_converges():
+    coarse, fine = inversion.total_vortex(1.0, 48, 0.2), inversion.total_vortex(1.0, 96, 0.2)
+    assert fine <= 0.007
+    assert np.log2(coarse / fine) >= 1.9
+    with pytest.raises(SimulationError, match="not a number"):
+        inversion.total_vortex(1.0, 96, 0.4)
+
+
 @pytest.mark.slow
 def test_the_vortex_converges_and_inverts_on_a_fine_grid():
     coarse, fine = inversion.vortex(0.1, 48), inversion.vortex(0.1, 96)

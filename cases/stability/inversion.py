@@ -7,6 +7,7 @@ import numpy as np
 from mpmopt.errors import SimulationError
 from mpmopt.scene import Grid, Material, Scene, Solid
 from mpmopt.scene.particles import discretise
+from mpmopt.simulation.lagrangian import LagrangianSimulation
 from stability.common import Array, Found, Line, Measured, Points, at_rest, solid
 
 AMPLITUDES = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.7, 1.0)
@@ -14,10 +15,68 @@ RING = Material(lame_lambda=1000 * 0.3 / (1.3 * 0.4), lame_mu=1000 / 2.6, densit
 CENTRE = 1.5
 
 
+class Vortex:
+    """The exact motion of material points, and the body force that makes it.
+
+    It turns radius R by alpha = A sin(pi t) (1 - 32 (R - 1)^2 + 256 (R - 1)^4).
+    """
+
+    def __init__(self, position: Array, amplitude: float) -> None:
+        X = position.T - CENTRE
+        self.amplitude = amplitude
+        self.R, self.angle = np.hypot(*X), np.arctan2(X[1], X[0])
+        e = self.R - 1.0
+        self.moved = np.abs(e) < 0.25
+        self.g = np.where(self.moved, 1.0 - 32.0 * e**2 + 256.0 * e**4, 0.0)
+        self.slope = np.where(self.moved, -64.0 * e + 1024.0 * e**3, 0.0)
+        self.curvature = np.where(self.moved, -64.0 + 3072.0 * e**2, 0.0)
+
+    def rotated(self, t: float) -> tuple[Array, Array, Array]:
+        """Unit vectors along the radius and across it, and alpha / g."""
+        time = self.amplitude * np.sin(np.pi * t)
+        turned = self.angle + time * self.g
+        return (
+            np.array([np.cos(turned), np.sin(turned)]),
+            np.array([-np.sin(turned), np.cos(turned)]),
+            np.array(time),
+        )
+
+    def position(self, t: float) -> Array:
+        """Where the points (2, N) are."""
+        return CENTRE + self.R * self.rotated(t)[0]
+
+    def force(self, t: float) -> Array:
+        """The body force (2, N), per mass."""
+        shear = RING.lame_mu / RING.density
+        outwards, across, time = self.rotated(t)
+        rate = self.amplitude * np.pi * np.cos(np.pi * t) * self.g
+        radial = -self.R * rate**2 + shear * self.R * (time * self.slope) ** 2
+        bent = self.R * self.curvature + 3.0 * self.slope
+        tangential = -self.R * np.pi**2 * time * self.g - shear * time * bent
+        return radial * outwards + tangential * across
+
+    def error(self, position: Array, t: float) -> float:
+        """Root mean square of what is missed by points (2, N) that move, in amplitudes."""
+        miss = (position - self.position(t))[:, self.moved]
+        return float(np.sqrt((miss**2).sum(axis=0).mean())) / self.amplitude
+
+
+def square(cells: int, courant: float, formulation: str = "updated") -> Scene:
+    """The solution has no displacement outside the ring: any body that holds it will do."""
+    dx = 2.0 * CENTRE / cells
+    return Scene(
+        Grid((cells, cells), dx),
+        time_step=courant * dx / RING.wave_speed,
+        steps=1,
+        material=RING,
+        body=(Solid((2 * dx, 2 * dx), (3.0 - 2 * dx, 3.0 - 2 * dx)),),
+        formulation=formulation,
+    )
+
+
 def vortex(amplitude: float, cells: int, duration: float = 1.0, courant: float = 0.4) -> float:
     """Root mean square error of the displacement at its worst, in amplitudes.
 
-    The exact motion turns radius R by alpha = A sin(pi t) (1 - 32 (R - 1)^2 + 256 (R - 1)^4).
     The body force is applied to the particles between steps.
 
     Raises
@@ -25,45 +84,14 @@ def vortex(amplitude: float, cells: int, duration: float = 1.0, courant: float =
     SimulationError
         If a particle inverts.
     """
-    dx = 2.0 * CENTRE / cells
-    dt = courant * dx / RING.wave_speed
-    scene = Scene(
-        Grid((cells, cells), dx),
-        time_step=dt,
-        steps=1,
-        material=RING,
-        body=(Solid((2 * dx, 2 * dx), (3.0 - 2 * dx, 3.0 - 2 * dx)),),
-    )
+    scene = square(cells, courant)
+    dx, dt = scene.grid.dx, scene.time_step
     everything = discretise(scene)
-    # The solution has no displacement at the edges: a rim of two cells holds them.
+    # A rim of two cells holds the edges.
     off = np.abs(np.hypot(*(everything.position - CENTRE).T) - 1.0)
     ring = everything.subset(off < 0.25 + 2.0 * dx)
-    X = ring.position.T - CENTRE
-    R, angle = np.hypot(*X), np.arctan2(X[1], X[0])
-    e = R - 1.0
-    moved = np.abs(e) < 0.25
-    g = np.where(moved, 1.0 - 32.0 * e**2 + 256.0 * e**4, 0.0)
-    slope = np.where(moved, -64.0 * e + 1024.0 * e**3, 0.0)
-    curvature = np.where(moved, -64.0 + 3072.0 * e**2, 0.0)
-    shear = RING.lame_mu / RING.density
-
-    def rotated(t: float) -> tuple[Array, Array, Array]:
-        """Unit vectors along the radius and across it, and alpha / g."""
-        time = amplitude * np.sin(np.pi * t)
-        turned = angle + time * g
-        return (
-            np.array([np.cos(turned), np.sin(turned)]),
-            np.array([-np.sin(turned), np.cos(turned)]),
-            np.array(time),
-        )
-
-    def force(t: float) -> Array:
-        outwards, across, time = rotated(t)
-        rate = amplitude * np.pi * np.cos(np.pi * t) * g
-        radial = -R * rate**2 + shear * R * (time * slope) ** 2
-        tangential = -R * np.pi**2 * time * g - shear * time * (R * curvature + 3.0 * slope)
-        return radial * outwards + tangential * across
-
+    exact = Vortex(ring.position, amplitude)
+    R, angle, g, slope = exact.R, exact.angle, exact.g, exact.slope
     state = at_rest(ring)
     # Velocity v0 = A pi g R across; its gradient is C, and F is one step behind.
     rate = amplitude * np.pi
@@ -79,11 +107,11 @@ def vortex(amplitude: float, cells: int, duration: float = 1.0, courant: float =
     state[4:8] = gradient.reshape(-1, 4).T
     start = np.linalg.inv(np.eye(2) + dt * gradient)
     state[8:12] = start.reshape(-1, 4).T
-    rim = np.flatnonzero(~moved)
+    rim = np.flatnonzero(~exact.moved)
     held = state[:, rim]
     worst = 0.0
     for step in range(round(duration / dt)):
-        state[2:4] += dt * force(step * dt)
+        state[2:4] += dt * exact.force(step * dt)
         try:
             state = solid(scene, ring, state).run()
         except SimulationError as error:
@@ -91,10 +119,43 @@ def vortex(amplitude: float, cells: int, duration: float = 1.0, courant: float =
                 error.what, step, error.particle, error.position, error.hint
             ) from error
         state[:, rim] = held
-        outwards, _, _ = rotated((step + 1) * dt)
-        miss = (state[0:2] - CENTRE - R * outwards)[:, moved]
-        worst = max(worst, float(np.sqrt((miss**2).sum(axis=0).mean())))
-    return worst / amplitude
+        worst = max(worst, exact.error(state[0:2], (step + 1) * dt))
+    return worst
+
+
+def total_vortex(amplitude: float, cells: int, courant: float = 0.4) -> float:
+    """The same error in the total Lagrangian formulation, of a whole square with free edges.
+
+    Raises
+    ------
+    SimulationError
+        If the step is too long for how far the body is stretched.
+    """
+    scene = square(cells, courant, "total")
+    dt, particles = scene.time_step, discretise(scene)
+    simulation = LagrangianSimulation(
+        scene, particles, RING.density * np.ones(len(particles.position)),
+        np.ones(len(particles.position)), np.zeros((1, 0)),
+    )  # fmt: skip
+    lattice, at = simulation.lattice, simulation.start[:2]
+    exact, of_nodes = Vortex(particles.position, amplitude), Vortex(at.T, amplitude)
+    # Velocities are half a step behind. A spline is an eighth of the curvature off its nodes.
+    v = (at - of_nodes.position(-dt)) / dt
+    v = v.reshape(2, lattice.rows + 2, -1)
+    bent = 4.0 * v - sum(np.roll(v, k, axis) for k in (1, -1) for axis in (1, 2))
+    states = np.zeros((2, *simulation.start.shape))
+    states[0] = simulation.start
+    there = lattice.mass > 0.0
+    states[0, 2:] = np.where(there, (v + bent / 8.0).reshape(2, -1), 0.0)
+    to_nodes = simulation._weights[0].T * (RING.density * lattice.volume)
+    worst = 0.0
+    for step in range(round(1.0 / dt)):
+        push = (to_nodes @ exact.force(step * dt).T).T[:, there]
+        states[0, 2:, there] += dt * (push / lattice.mass[there]).T
+        simulation._advance(states, 0, 1, 0)
+        states[0] = states[1]
+        worst = max(worst, exact.error(simulation.particle_state(states[0])[:2], (step + 1) * dt))
+    return worst
 
 
 def vortex_stretch(amplitude: float) -> float:
