@@ -24,7 +24,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from walker import walker
+from walker import walker, walker_on_ground
 
 from mpmopt.design.objective import Objective
 from mpmopt.design.problem import Problem
@@ -119,6 +119,30 @@ def threads_and_schedules(steps: int, rounds: int) -> str:
             )
     header = ["what", "threads", "ns per particle and step", "forward runs", "times one thread"]
     return table(f"The paper's walker, {steps} steps, by threads and schedule", header, rows)
+
+
+def formulations(steps: int, rounds: int) -> str:
+    """The walker on ground, viscous, in both formulations, by one thread."""
+    scene = replace(walker_on_ground(128, 2e-4, 15), steps=steps, transient=0.0)
+    runs: dict[str, Run] = {}
+    for kind in ("updated", "total"):
+        problem = Problem(replace(scene, formulation=kind))
+        phi = np.random.default_rng(0).uniform(-0.5, 0.5, int(problem.particles.designed.sum()))
+        simulation = problem.simulation(problem.join(phi, 1.0, -0.3, -0.5))
+        objective = Objective.of(scene, simulation.particles)
+        count = simulation.initial.shape[1]
+        runs[f"forward {kind}"] = with_threads(1, simulation.run)
+        runs[f"both {kind}"] = with_threads(
+            1, partial(gradient_of, simulation, objective, KEEP_ALL)
+        )
+    seconds = in_turns(runs, rounds)
+    rows = []
+    for what, name in (("forward", "forward"), ("both", "value + gradient, states kept")):
+        updated, total = seconds[f"{what} updated"], seconds[f"{what} total"]
+        per = [f"{np.median(each) / (steps * count) * 1e9:.1f}" for each in (updated, total)]
+        rows.append([name, *per, f"{ratio(total, updated):.2f}"])
+    header = ["ns per particle and step", "MLS-MPM", "total Lagrangian", "ratio"]
+    return table(f"The walker on ground, {count} particles, by formulation", header, rows)
 
 
 def sizes(quick: bool, rounds: int) -> str:
@@ -283,6 +307,7 @@ def main() -> int:
         f"Measured on {datetime.date.today()}, {os.cpu_count()} cores of {processor()}, Python "
         f"{platform.python_version()}, {versions} medians of {rounds} rounds.\n",
         threads_and_schedules(arguments.steps, rounds),
+        formulations(arguments.steps, rounds),
         sizes(arguments.quick, 3),
         start_up(),
         f"Peak memory of one gradient at 5000 steps: {peak_memory('mpmopt', 5000):.0f} MB.\n",
