@@ -25,6 +25,7 @@ from mpmopt.kernels.ground import (
 )
 from mpmopt.kernels.layer import bearing, bearing_adjoint, resistance, resistance_adjoint
 from mpmopt.kernels.material import solid_constants
+from mpmopt.kernels.pairs import nowhere, push_apart, push_apart_adjoint, renewed
 from mpmopt.kernels.simd import (
     above,
     add,
@@ -67,6 +68,7 @@ class Lattice(NamedTuple):
     active: NDArray[np.bool_]  # (A B R,) whether a group has actuated particles
     actuation_stress: NDArray[np.float64]  # (K, 3) second Piola-Kirchhoff S: xx, xy, yy
     mass: NDArray  # (M,) of the nodes, lumped
+    touch: Any  # `kernels.pairs.Touch`
     ground: Any  # `kernels.ground.Ground`
     nodes_y: int  # of the grid that the ground's table is for, and how many along x
     nodes_x: int
@@ -77,11 +79,13 @@ class LatticeBar(NamedTuple):
 
     stiffness: NDArray  # (A B R, 4)
     mass: NDArray  # (M,)
+    grip: NDArray  # (A B, n n) of `Touch`
 
     @classmethod
     def zeros(cls, lattice: Lattice, dtype: DTypeLike = float) -> "LatticeBar":
         """Nothing accumulated yet."""
-        return cls(np.zeros(lattice.stiffness.shape, dtype), np.zeros(lattice.mass.shape, dtype))
+        shapes = lattice.stiffness.shape, lattice.mass.shape, lattice.touch.grip.shape
+        return cls(*(np.zeros(shape, dtype) for shape in shapes))
 
 
 @jit
@@ -417,7 +421,7 @@ def advance_lattice(
     records = COEFFICIENTS * window[2] * window[3]
     cells, moments = np.zeros((records, 4), states.dtype), np.zeros((records, 4), states.dtype)
     force = np.zeros((nodes, 4), states.dtype)
-    dt = lattice.dt
+    dt, near = lattice.dt, nowhere(lattice.touch)
     for n in range(first, last):
         old, new = states[n % len(states)], states[(n + 1) % len(states)]
         taylor(old, window, window, cells)
@@ -426,6 +430,9 @@ def advance_lattice(
         if len(lattice.ground.layers):
             press(cells, moments, lattice)
         taylor_adjoint(moments, window, force)
+        near = renewed(near, old, lattice.touch)
+        if len(near.pairs):
+            push_apart(near, old, lattice.touch, force)
         if lattice.mirror_axis >= 0:
             fold(force, lattice)
         push = pushes[n % len(pushes)]
@@ -482,7 +489,7 @@ def advance_lattice_adjoint(
     cells, cells_bar = np.zeros((records, 4), states.dtype), np.zeros((records, 4), states.dtype)
     moments = np.zeros((records, 4), states.dtype)
     force_bar, back = np.zeros((nodes, 4), states.dtype), np.zeros((nodes, 4), states.dtype)
-    dt = lattice.dt
+    dt, near = lattice.dt, nowhere(lattice.touch)
     for n in range(last - 1, first - 1, -1):
         old, new = states[n], states[n + 1]
         for i in range(nodes):
@@ -521,6 +528,9 @@ def advance_lattice_adjoint(
                 state_bar[i, 2] = state_bar[i, 3] = 0.0
         if lattice.mirror_axis >= 0:
             fold(force_bar, lattice)
+        near = renewed(near, old, lattice.touch)
+        if len(near.pairs):
+            push_apart_adjoint(near, old, lattice.touch, force_bar, state_bar, bar.grip)
         taylor(old, window, window, cells)
         taylor(force_bar, window, window, cells_bar)
         clear(moments, window)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from mpmopt import kernels
 from mpmopt.errors import DesignError, SimulationError
-from mpmopt.kernels import lagrangian
+from mpmopt.kernels import lagrangian, pairs
 from mpmopt.simulation.buffers import Memory
 from mpmopt.simulation.checkpoints import Checkpointing, Checkpoints, Schedule
 from mpmopt.simulation.energy import LOOK
@@ -80,6 +80,7 @@ class LagrangianSimulation(Simulation):
             active=np.any(actuated, axis=(0, 2)),
             actuation_stress=self.data.actuation_stress,
             mass=self._folded(mass, axis, int(rows)),
+            touch=self._touch(cell, place, low, high, of_particles),
             ground=self.parameters.ground,
             nodes_y=self.parameters.nodes_y,
             nodes_x=self.parameters.nodes_x,
@@ -98,6 +99,45 @@ class LagrangianSimulation(Simulation):
             k = scene.mirror.normal
             high[k] = min(high[k], round(scene.mirror.position / dx))
         return low, high
+
+    def _touch(
+        self,
+        cell: NDArray[np.int64],
+        place: NDArray[np.int64],
+        low: NDArray[np.int64],
+        high: NDArray[np.int64],
+        of_particles: Callable[[NDArray], NDArray],
+    ) -> pairs.Touch:
+        """What of the body may touch the rest of it."""
+        mirror, dx, per_cell = self.scene.mirror, self.scene.grid.dx, self.scene.particles_per_cell
+        columns, rows = (int(count) for count in high - low)
+        lam, mu = (of_particles(each) for each in self.data.constants[:2])
+        stiffness, volume = of_particles(self.data.stiffness), (dx / per_cell) ** 2
+        grip, self._grip_slope = pairs.grips(stiffness, lam + 2.0 * mu, volume, dx)
+        grips = np.zeros((columns * rows, per_cell**2), grip.dtype)
+        self._seat = cell[:, 0] * rows + cell[:, 1], place[:, 0] * per_cell + place[:, 1]
+        grips[self._seat] = grip
+        cells = np.nonzero(np.any(grips.real > 0.0, axis=1))[0]
+        nodes = np.zeros((columns + 2, rows + 2))
+        for a in range(3):
+            for b in range(3):
+                nodes[cells // rows + a, cells % rows + b] = 1.0
+        t = (np.arange(per_cell) + 0.5) / per_cell
+        value = np.stack([0.5 * (1.0 - t) ** 2, 0.75 - (t - 0.5) ** 2, 0.5 * t**2], axis=1)
+        axis = -1 if mirror is None else mirror.normal
+        return pairs.Touch(
+            dx=dx,
+            per_cell=per_cell,
+            rows=rows,
+            axis=axis,
+            line=0 if mirror is None else round(mirror.position / dx) - int(low[axis]),
+            plane=0.0 if mirror is None else mirror.position,
+            weights=np.einsum("am,bn->abmn", value, value).reshape(per_cell**2, 9),
+            grip=grips,
+            cells=cells,
+            nodes=nodes.ravel(),
+            alone=np.full((self.nodes, 2), pairs.NOWHERE),
+        )
 
     def _mirror_axis(self, high: NDArray[np.int64]) -> int:
         """Of the plane that bounds the lattice, or -1."""
@@ -347,7 +387,8 @@ class LagrangianForward(Forward):
         volume = simulation.particles.volume
         return Gradient(
             density=volume * (simulation._weights[0] @ mass_bar),
-            stiffness=bar.stiffness.ravel()[simulation._slot],
+            stiffness=bar.stiffness.ravel()[simulation._slot]
+            + simulation._grip_slope * bar.grip[simulation._seat],
             signal=signal_bar,
             state=state_bar,
         )
