@@ -111,9 +111,9 @@ def test_the_force_is_that_of_all_pairs(rng, corners, changes, per_cell):
     for _ in range(18):  # crumpled more and more: lists are kept, and made anew
         nodes[:, :2] += 0.15 * (8 * C - nodes[:, :2])
         nodes[:, :2] += 0.05 * C * rng.standard_normal((len(nodes), 2))
-        near = pairs.renewed(near, nodes, touch)
+        near = pairs.renewed(near, nodes.T, touch)
         force = np.zeros_like(nodes)
-        pairs.push_apart(near, nodes, touch, force)
+        pairs.push_apart(near, nodes.T, touch, force.T)
         expected = by_hand(simulation, nodes)
         assert force[:, :2] == pytest.approx(expected, rel=1e-12, abs=1e-12)
         seen += np.abs(expected).max() > 0.0
@@ -273,5 +273,5 @@ def test_void_pushes_nothing_and_solid_takes_no_notice_of_it():
     simulation = simulation_of(scene, stiffness)
     nodes, touch = simulation.start.copy(), simulation.lattice.touch
     nodes[nodes[:, 0] > 6.5 * C, 0] -= 6 * C
-    near = pairs.renewed(pairs.nowhere(touch), nodes, touch)
+    near = pairs.renewed(pairs.nowhere(touch), nodes.T, touch)
     assert len(near.cells) == 0

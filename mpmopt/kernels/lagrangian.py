@@ -430,9 +430,9 @@ def advance_lattice(
         if len(lattice.ground.layers):
             press(cells, moments, lattice)
         taylor_adjoint(moments, window, force)
-        near = renewed(near, old, lattice.touch)
+        near = renewed(near, old.T, lattice.touch)
         if len(near.pairs):
-            push_apart(near, old, lattice.touch, force)
+            push_apart(near, old.T, lattice.touch, force.T)
         if lattice.mirror_axis >= 0:
             fold(force, lattice)
         push = pushes[n % len(pushes)]
@@ -528,9 +528,9 @@ def advance_lattice_adjoint(
                 state_bar[i, 2] = state_bar[i, 3] = 0.0
         if lattice.mirror_axis >= 0:
             fold(force_bar, lattice)
-        near = renewed(near, old, lattice.touch)
+        near = renewed(near, old.T, lattice.touch)
         if len(near.pairs):
-            push_apart_adjoint(near, old, lattice.touch, force_bar, state_bar, bar.grip)
+            push_apart_adjoint(near, old.T, lattice.touch, force_bar.T, state_bar.T, bar.grip)
         taylor(old, window, window, cells)
         taylor(force_bar, window, window, cells_bar)
         clear(moments, window)

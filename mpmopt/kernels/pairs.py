@@ -34,15 +34,16 @@ class Touch(NamedTuple):
 
     dx: float
     per_cell: int  # n
-    rows: int  # cells along y
     axis: int  # of a mirror plane's normal, 0 or 1; -1: no mirror
-    line: int  # the plane is on the lower edge of cells with this number
     plane: float  # its position
+    corner: NDArray[np.int64]  # (2 C, 2) place of a cell, and of its image, on the lattice
+    first: NDArray[np.int64]  # (C,) first node of a cell
+    offset: NDArray[np.int64]  # (9,) of the cell's nodes from the first
     weights: NDArray[np.float64]  # (n n, 9) N_ip of the nodes of a particle's cell
     grip: NDArray  # (C, n n) g of the particles
     cells: NDArray[np.int64]  # those with a grip above zero
     nodes: NDArray[np.float64]  # (M,) 1 for the nodes of these cells, else 0
-    alone: NDArray[np.float64]  # (M, 2) where the nodes were when no cells were near; a cache
+    alone: NDArray[np.float64]  # (2, M) where the nodes were when no cells were near; a cache
 
 
 class Near(NamedTuple):
@@ -51,35 +52,32 @@ class Near(NamedTuple):
     Cells with numbers from C on, and particles from C n n on, are images across the mirror plane.
     """
 
-    cells_at: NDArray[np.float64]  # (M, 2) nodes when near cells were looked for
+    cells_at: NDArray[np.float64]  # (2, M) nodes when near cells were looked for
     cells: NDArray[np.int64]  # (., 2)
-    at: NDArray[np.float64]  # (M, 2) nodes when near particles were looked for
+    at: NDArray[np.float64]  # (2, M) nodes when near particles were looked for
     pairs: NDArray[np.int64]  # (., 2) of particles
     members: NDArray[np.int64]  # cells that have particles in pairs
 
 
 @jit
 def position(nodes, touch, cell, k):
-    """Of particle k of a cell, from the first two numbers of the nodes' records."""
-    first = (cell // touch.rows) * (touch.rows + 2) + cell % touch.rows
-    x = y = 0.0 * nodes[first, 0]
+    """Of particle k of a cell, from the first two rows of numbers of the nodes."""
+    first = touch.first[cell]
+    x = y = 0.0 * nodes[0, first]
     for m in range(9):
-        w, i = touch.weights[k, m], first + (m // 3) * (touch.rows + 2) + m % 3
-        x += w * nodes[i, 0]
-        y += w * nodes[i, 1]
+        w, i = touch.weights[k, m], first + touch.offset[m]
+        x += w * nodes[0, i]
+        y += w * nodes[1, i]
     return x, y
 
 
 @jit
 def site(touch, cell, k):
     """Of a particle or an image on the lattice of particles in the reference configuration."""
-    own = cell % len(touch.grip)
-    i = (own // touch.rows) * touch.per_cell + k // touch.per_cell
-    j = (own % touch.rows) * touch.per_cell + k % touch.per_cell
-    if own != cell:
-        last = 2 * touch.line * touch.per_cell - 1
-        return (last - i, j) if touch.axis == 0 else (i, last - j)
-    return i, j
+    i, j, n = k // touch.per_cell, k % touch.per_cell, touch.per_cell
+    if cell >= len(touch.grip):  # an image is seen from behind
+        i, j = (n - 1 - i, j) if touch.axis == 0 else (i, n - 1 - j)
+    return n * touch.corner[cell, 0] + i, n * touch.corner[cell, 1] + j
 
 
 @jit
@@ -98,8 +96,8 @@ def flipped(x, y, touch):
 def moved(nodes, at, touch, limit):
     """Whether a node of what may touch is farther than `limit` from where it was."""
     far = 0
-    for i in range(len(at)):
-        dx, dy = nodes[i, 0].real - at[i, 0], nodes[i, 1].real - at[i, 1]
+    for i in range(at.shape[1]):
+        dx, dy = nodes[0, i].real - at[0, i], nodes[1, i].real - at[1, i]
         far += touch.nodes[i] * (dx * dx + dy * dy) > limit * limit
     return far > 0
 
@@ -184,7 +182,7 @@ def look_for_cells(nodes, touch):
                         # A cell and another's image are the other cell and this one's image.
                         near = gap_x * gap_x + gap_y * gap_y < reach * reach
                         near = near and cells[m] % count >= cells[n]
-                        if near and farthest(touch, cells[n], cells[m]) > FAR * touch.per_cell:
+                        if near and are_far(touch, cells[n], cells[m]):
                             partners[size] = cells[m]
                             size += 1
                         m = older[m]
@@ -201,15 +199,12 @@ def look_for_cells(nodes, touch):
 
 
 @jit
-def farthest(touch, a, b):
-    """Most that particles of two cells were apart, in particle spacings."""
-    i, j = site(touch, a, 0)
-    di = dj = 0
-    for k in (0, touch.grip.shape[1] - 1):
-        p, q = site(touch, b, k)
-        di = max(di, abs(p - i), abs(p - i - touch.per_cell + 1))
-        dj = max(dj, abs(q - j), abs(q - j - touch.per_cell + 1))
-    return math.sqrt(di * di + dj * dj)
+def are_far(touch, a, b):
+    """Whether any particles of two cells were farther apart than what is one part."""
+    rim = touch.per_cell - 1
+    i = touch.per_cell * abs(touch.corner[a, 0] - touch.corner[b, 0]) + rim
+    j = touch.per_cell * abs(touch.corner[a, 1] - touch.corner[b, 1]) + rim
+    return i * i + j * j > (FAR * touch.per_cell) ** 2
 
 
 @loop_jit
@@ -247,22 +242,26 @@ def look_for_particles(nodes, touch, cells):
     return found[:total].copy(), np.nonzero(there)[0]
 
 
+@jit
+def places(nodes):
+    """Real parts (2, M) of the nodes' positions."""
+    at = np.empty((2, nodes.shape[1]))
+    for i in range(nodes.shape[1]):
+        at[0, i], at[1, i] = nodes[0, i].real, nodes[1, i].real
+    return at
+
+
 @loop_jit
 def renewed(near: Any, nodes: NDArray, touch: Any) -> Near:
-    """The lists, made anew where nodes have moved too far for them."""
+    """The lists for nodes (., M), of which the first two rows are x and y: anew if they moved."""
     if moved(nodes, near.cells_at, touch, HALF * WIDE_SKIN * touch.dx):
-        at = np.empty((len(nodes), 2))
-        for i in range(len(nodes)):
-            at[i, 0], at[i, 1] = nodes[i, 0].real, nodes[i, 1].real
-        near = nowhere(touch)
+        at, old = places(nodes), nowhere(touch)
         cells = look_for_cells(at, touch)
         if len(cells) == 0:
             touch.alone[:] = at
-        near = Near(at, cells, near.at, near.pairs, near.members)
+        near = Near(at, cells, old.at, old.pairs, old.members)
     if len(near.cells) > 0 and moved(nodes, near.at, touch, HALF * SKIN * touch.dx):
-        at = np.empty((len(nodes), 2))
-        for i in range(len(nodes)):
-            at[i, 0], at[i, 1] = nodes[i, 0].real, nodes[i, 1].real
+        at = places(nodes)
         pairs, members = look_for_particles(at, touch, near.cells)
         near = Near(near.cells_at, near.cells, at, pairs, members)
     return near
@@ -270,7 +269,7 @@ def renewed(near: Any, nodes: NDArray, touch: Any) -> Near:
 
 @loop_jit
 def push_apart(near: Any, nodes: NDArray, touch: Any, force: NDArray) -> None:
-    """Adds the pairs' forces to the first two numbers of the nodes' records `force`."""
+    """Adds the pairs' forces to the first two rows of the nodes' `force` (., M)."""
     size, reach = touch.grip.shape[1], REACH * touch.dx
     count = touch.grip.size
     grip = touch.grip.ravel()
@@ -300,18 +299,18 @@ def push_apart(near: Any, nodes: NDArray, touch: Any, force: NDArray) -> None:
 
 
 @jit
-def spread(near, touch, pushes, force):
-    """Adds numbers (., 2) of particles to the nodes' records: the transpose of `position`."""
+def spread(near, touch, numbers, nodes):
+    """Adds numbers (., 2) of particles to those of the nodes: the transpose of `position`."""
     size = touch.grip.shape[1]
     for c in near.members:
-        first = (c // touch.rows) * (touch.rows + 2) + c % touch.rows
+        first = touch.first[c]
         for k in range(size):
-            fx, fy = pushes[c * size + k, 0], pushes[c * size + k, 1]
-            if fx != 0.0 or fy != 0.0:
+            x, y = numbers[c * size + k, 0], numbers[c * size + k, 1]
+            if x != 0.0 or y != 0.0:
                 for m in range(9):
-                    w, i = touch.weights[k, m], first + (m // 3) * (touch.rows + 2) + m % 3
-                    force[i, 0] += w * fx
-                    force[i, 1] += w * fy
+                    w, i = touch.weights[k, m], first + touch.offset[m]
+                    nodes[0, i] += w * x
+                    nodes[1, i] += w * y
 
 
 @loop_jit
@@ -323,7 +322,7 @@ def push_apart_adjoint(
     state_bar: NDArray,
     grip_bar: NDArray,
 ) -> None:
-    """Adds to the nodes' x_bar, the first two numbers of records, and to grip_bar (C, n n)."""
+    """Adds to x_bar, the first two rows of the nodes' state_bar (., M), and to grip_bar (C, n n)."""
     size, reach = touch.grip.shape[1], REACH * touch.dx
     count = touch.grip.size
     grip, grip_bar = touch.grip.ravel(), grip_bar.ravel()

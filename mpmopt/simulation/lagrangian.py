@@ -124,19 +124,25 @@ class LagrangianSimulation(Simulation):
                 nodes[cells // rows + a, cells % rows + b] = 1.0
         t = (np.arange(per_cell) + 0.5) / per_cell
         value = np.stack([0.5 * (1.0 - t) ** 2, 0.75 - (t - 0.5) ** 2, 0.5 * t**2], axis=1)
-        axis = -1 if mirror is None else mirror.normal
+        corner = np.stack(np.divmod(np.arange(columns * rows), rows), axis=1)
+        image, axis = corner.copy(), -1
+        if mirror is not None:
+            axis = mirror.normal
+            line = round(mirror.position / dx) - int(low[axis])
+            image[:, axis] = 2 * line - 1 - image[:, axis]
         return pairs.Touch(
             dx=dx,
             per_cell=per_cell,
-            rows=rows,
             axis=axis,
-            line=0 if mirror is None else round(mirror.position / dx) - int(low[axis]),
             plane=0.0 if mirror is None else mirror.position,
+            corner=np.concatenate([corner, image]),
+            first=corner @ [rows + 2, 1],
+            offset=np.add.outer((rows + 2) * np.arange(3), np.arange(3)).ravel(),
             weights=np.einsum("am,bn->abmn", value, value).reshape(per_cell**2, 9),
             grip=grips,
             cells=cells,
             nodes=nodes.ravel(),
-            alone=np.full((self.nodes, 2), pairs.NOWHERE),
+            alone=np.full((2, self.nodes), pairs.NOWHERE),
         )
 
     def _mirror_axis(self, high: NDArray[np.int64]) -> int:
