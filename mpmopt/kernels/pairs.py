@@ -177,14 +177,15 @@ def look_for_cells(nodes, touch):
                 for b in range(max(j - 1, 0), min(j + 2, rows)):
                     m = newest[a * rows + b]
                     while m >= 0:
-                        gap_x = max(boxes[m, 0] - boxes[n, 2], boxes[n, 0] - boxes[m, 2], 0.0)
-                        gap_y = max(boxes[m, 1] - boxes[n, 3], boxes[n, 1] - boxes[m, 3], 0.0)
-                        # A cell and another's image are the other cell and this one's image.
-                        near = gap_x * gap_x + gap_y * gap_y < reach * reach
-                        near = near and cells[m] % count >= cells[n]
-                        if near and are_far(touch, cells[n], cells[m]):
-                            partners[size] = cells[m]
-                            size += 1
+                        # Most are near in the reference configuration.
+                        if are_far(touch, cells[n], cells[m]):
+                            gap_x = max(boxes[m, 0] - boxes[n, 2], boxes[n, 0] - boxes[m, 2], 0.0)
+                            gap_y = max(boxes[m, 1] - boxes[n, 3], boxes[n, 1] - boxes[m, 3], 0.0)
+                            near = gap_x * gap_x + gap_y * gap_y < reach * reach
+                            # A cell and another's image are the other and this one's image.
+                            if near and cells[m] % count >= cells[n]:
+                                partners[size] = cells[m]
+                                size += 1
                         m = older[m]
             partners[:size].sort()
             while total + size > len(found):
@@ -201,10 +202,10 @@ def look_for_cells(nodes, touch):
 @jit
 def are_far(touch, a, b):
     """Whether any particles of two cells were farther apart than what is one part."""
-    rim = touch.per_cell - 1
-    i = touch.per_cell * abs(touch.corner[a, 0] - touch.corner[b, 0]) + rim
-    j = touch.per_cell * abs(touch.corner[a, 1] - touch.corner[b, 1]) + rim
-    return i * i + j * j > (FAR * touch.per_cell) ** 2
+    rim = 1.0 - 1.0 / touch.per_cell
+    i = abs(touch.corner[a, 0] - touch.corner[b, 0]) + rim
+    j = abs(touch.corner[a, 1] - touch.corner[b, 1]) + rim
+    return i * i + j * j > FAR * FAR
 
 
 @loop_jit
@@ -322,7 +323,7 @@ def push_apart_adjoint(
     state_bar: NDArray,
     grip_bar: NDArray,
 ) -> None:
-    """Adds to x_bar, the first two rows of the nodes' state_bar (., M), and to grip_bar (C, n n)."""
+    """Adds to x_bar, the first two rows of the nodes' `state_bar`, and to `grip_bar` (C, n n)."""
     size, reach = touch.grip.shape[1], REACH * touch.dx
     count = touch.grip.size
     grip, grip_bar = touch.grip.ravel(), grip_bar.ravel()
