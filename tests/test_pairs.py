@@ -57,20 +57,20 @@ def simulation_of(scene, stiffness=None, density=None, **changes) -> Any:
 
 def closing(simulation, speed):
     """Gives nodes a velocity towards x = 8 C, in proportion to their distance, and a spin."""
-    x, y = simulation.start[:, 0].real, simulation.start[:, 1].real
-    simulation.start[:, 2] = speed * (8 * C - x) / (4 * C)
+    x, y = simulation.start[:2].real
+    simulation.start[2] = speed * (8 * C - x) / (4 * C)
     if simulation.scene.mirror is None:
-        simulation.start[:, 3] = 0.1 * speed * np.sign(x - 8 * C)
+        simulation.start[3] = 0.1 * speed * np.sign(x - 8 * C)
     lifted = np.clip((y - 5 * C) / (2 * C), 0.0, 1.0)
     if len(simulation.scene.body) == 3:  # the fork's prongs only
-        simulation.start[:, 2] *= lifted
+        simulation.start[2] *= lifted
 
 
 def by_hand(simulation, nodes):
     """Forces on the nodes, pair by pair of all particles and images."""
     scene, dx = simulation.scene, simulation.scene.grid.dx
     N = simulation._weights[0].toarray()
-    X, x = simulation.particles.position, N @ nodes[:, :2]
+    X, x = simulation.particles.position, N @ nodes[:2].T
     gamma = kernels.ungrouped(simulation.data.stiffness, 1, len(X))[0]
     share = np.maximum(gamma - 0.05, 0.0) / 0.95
     material, volume = scene.material, (dx / scene.particles_per_cell) ** 2
@@ -88,7 +88,7 @@ def by_hand(simulation, nodes):
         touching = apart & (r < reach)
         size = np.where(touching, k * share[:, None] * share * (reach - r), 0.0)
         force += ((size / np.where(touching, r, 1.0))[..., None] * d).sum(axis=1)
-    return N.T @ force
+    return (N.T @ force).T
 
 
 @pytest.mark.parametrize("per_cell", [2, 3])
@@ -109,13 +109,13 @@ def test_the_force_is_that_of_all_pairs(rng, corners, changes, per_cell):
     nodes, touch = simulation.start.copy(), simulation.lattice.touch
     near, seen = pairs.nowhere(touch), 0
     for _ in range(18):  # crumpled more and more: lists are kept, and made anew
-        nodes[:, :2] += 0.15 * (8 * C - nodes[:, :2])
-        nodes[:, :2] += 0.05 * C * rng.standard_normal((len(nodes), 2))
-        near = pairs.renewed(near, nodes.T, touch)
+        nodes[:2] += 0.15 * (8 * C - nodes[:2])
+        nodes[:2] += 0.05 * C * rng.standard_normal((2, nodes.shape[1]))
+        near = pairs.renewed(near, nodes, touch)
         force = np.zeros_like(nodes)
-        pairs.push_apart(near, nodes.T, touch, force.T)
+        pairs.push_apart(near, nodes, touch, force)
         expected = by_hand(simulation, nodes)
-        assert force[:, :2] == pytest.approx(expected, rel=1e-12, abs=1e-12)
+        assert force[:2] == pytest.approx(expected, rel=1e-12, abs=1e-12)
         seen += np.abs(expected).max() > 0.0
     assert seen >= 2
 
@@ -126,19 +126,18 @@ def collided(simulation, speed):
     states = np.zeros((steps + 1, *simulation.start.shape))
     states[0] = simulation.start
     lattice, signal = simulation.lattice, simulation.signal
-    pushes = np.zeros((steps, simulation.nodes))
-    assert lagrangian.advance_lattice(states, pushes, 0, steps, lattice, signal)[1] < 0
+    assert lagrangian.advance_lattice(states, 0, steps, lattice, signal)[1] < 0
     return states
 
 
 def test_blocks_that_collide_keep_their_momenta_and_bounce():
     simulation = simulation_of(body(*APART, steps=80))
     states = collided(simulation, 3.0)
-    x, v, m = states[..., :2], states[..., 2:], simulation.lattice.mass
-    linear = np.einsum("m,smk->sk", m, v)
+    x, v, m = states[:, :2], states[:, 2:], simulation.lattice.mass
+    linear = np.einsum("m,skm->sk", m, v)
     before = x - simulation.scene.time_step * v
-    angular = np.einsum("m,sm->s", m, before[..., 0] * v[..., 1] - before[..., 1] * v[..., 0])
-    scale = np.abs(m[:, None] * v[0]).sum()
+    angular = np.einsum("m,sm->s", m, before[:, 0] * v[:, 1] - before[:, 1] * v[:, 0])
+    scale = np.abs(m * v[0]).sum()
     assert np.abs(linear - linear[0]).max() <= 1e-13 * scale
     assert np.abs(angular - angular[0]).max() <= 1e-13 * scale
     left = simulation.particles.position[:, 0] < 6 * C
@@ -222,7 +221,7 @@ def test_half_a_body_pushes_its_image_as_the_whole_one_does(corners):
     half = simulation_of(body(*corners, steps=60, mirror=Mirror("x", 8 * C)))
     for each in (whole, half):
         closing(each, 4.0)
-        each.start[:, 3] = 0.0
+        each.start[3] = 0.0
     left = whole.particles.position[:, 0] < 8 * C
     expected = whole.run()[:, left]
     own, position = half.particles.position, whole.particles.position[left]
@@ -254,9 +253,9 @@ def test_a_block_rests_on_another_at_the_gap_that_bears_it():
 
     weight = g * material.density * 10 * 4 * s * s
     gap = brentq(lambda y: borne(y) - weight, 0.1 * C, reach)
-    upper = simulation.start[:, 1] > 8 * C
-    simulation.start[upper, 0] += 0.5 * s
-    simulation.start[upper, 1] -= 5 * C + s - gap
+    upper = simulation.start[1] > 8 * C
+    simulation.start[0, upper] += 0.5 * s
+    simulation.start[1, upper] -= 5 * C + s - gap
     found = []
     for state in simulation.run(range(200, 601, 4)):
         low = simulation.particles.position[:, 1] < 8 * C
@@ -272,6 +271,6 @@ def test_void_pushes_nothing_and_solid_takes_no_notice_of_it():
     stiffness = np.where(position[:, 0] < 6 * C, 1.0, pairs.LEAST_STIFFNESS)
     simulation = simulation_of(scene, stiffness)
     nodes, touch = simulation.start.copy(), simulation.lattice.touch
-    nodes[nodes[:, 0] > 6.5 * C, 0] -= 6 * C
-    near = pairs.renewed(pairs.nowhere(touch), nodes.T, touch)
+    nodes[0, nodes[0] > 6.5 * C] -= 6 * C
+    near = pairs.renewed(pairs.nowhere(touch), nodes, touch)
     assert len(near.cells) == 0

@@ -44,6 +44,9 @@ OPTIONS: dict[str, Any] = {
     "fastmath": {"contract", "reassoc", "nsz", "arcp"},
 }
 
+# Without the counting of references to arrays.
+BARE: dict[str, Any] = {**OPTIONS, "_nrt": False}
+
 
 def loop_jit(function: Callable[..., Any]) -> Any:
     """Compile a loop that Python calls."""
@@ -57,6 +60,19 @@ def jit(function: Callable[..., Any]) -> Any:
     disk cache, and with it the last bits.
     """
     return _stamped(njit(**OPTIONS, forceinline=True)(function))
+
+
+def bare_jit(function: Callable[..., Any]) -> Any:
+    """As `jit`, for kernels that make no arrays: they count no references to those they take.
+
+    Counting costs more than a short kernel does whose tuples hold many arrays.
+    """
+    return _stamped(njit(**BARE, forceinline=True)(function))
+
+
+def bare_loop_jit(function: Callable[..., Any]) -> Any:
+    """As `bare_jit`, of a loop that stands by itself."""
+    return _stamped(njit(**BARE)(function))
 
 
 def plain(kernel: Any) -> Any:
