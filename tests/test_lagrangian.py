@@ -328,6 +328,7 @@ def test_an_isolated_cell_is_stable_up_to_the_limit_and_not_far_beyond():
 def test_both_formulations_walk_alike():
     scene = dataclasses.replace(
         walker(64, 8e-4), walls=(), steps=1250, material=Material(viscosity=0.02),
+        gravity=(0.0, -1.0),  # under more its legs fold, and touch
         ground=(Ground(((0.0, 4 / 64), (1.0, 4 / 64)), friction=0.5),),
     )  # fmt: skip
     particles = discretise(scene)
@@ -343,7 +344,7 @@ def test_both_formulations_walk_alike():
         ends = simulation.run([0, 1250])[:, 0, ~particles.designed].mean(axis=1)
         gone.append(ends[1] - ends[0])
     assert gone[0] > 0.04
-    assert gone[1] == pytest.approx(gone[0], rel=0.1)
+    assert gone[1] == pytest.approx(gone[0], rel=0.05)
 
 
 @pytest.mark.parametrize(

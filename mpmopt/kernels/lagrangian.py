@@ -30,6 +30,7 @@ from mpmopt.kernels.ground import (
 )
 from mpmopt.kernels.layer import bearing, bearing_adjoint, resistance, resistance_adjoint
 from mpmopt.kernels.material import solid_constants
+from mpmopt.kernels.pairs import nowhere, push_apart, push_apart_adjoint, renewed
 from mpmopt.kernels.simd import (
     above,
     add,
@@ -81,6 +82,7 @@ class Lattice(NamedTuple):
     active: NDArray[np.bool_]  # (V,) whether a record has actuated particles
     actuation_stress: NDArray[np.float64]  # (K, 3) second Piola-Kirchhoff S: xx, xy, yy
     mass: NDArray  # (M,) of the nodes, lumped
+    touch: Any  # `kernels.pairs.Touch`
     ground: Any  # `kernels.ground.Ground`
     nodes_y: int  # of the grid that the ground's table is for, and how many along x
     nodes_x: int
@@ -91,11 +93,13 @@ class LatticeBar(NamedTuple):
 
     stiffness: NDArray  # (V, 4)
     mass: NDArray  # (M,)
+    grip: NDArray  # (C, n n) of `Touch`
 
     @classmethod
     def zeros(cls, lattice: Lattice, dtype: DTypeLike = float) -> "LatticeBar":
         """Nothing accumulated yet."""
-        return cls(np.zeros(lattice.stiffness.shape, dtype), np.zeros(lattice.mass.shape, dtype))
+        shapes = lattice.stiffness.shape, lattice.mass.shape, lattice.touch.grip.shape
+        return cls(*(np.zeros(shape, dtype) for shape in shapes))
 
 
 class Rows(NamedTuple):
@@ -699,7 +703,7 @@ def advance_lattice(
     """
     rows, force = make_rows(4, 3, lattice), np.zeros((3, len(lattice.mass)), states.dtype)
     near, per_mass = np.zeros(len(lattice.filled), np.bool_), steps_per_mass(lattice)
-    moved = math.inf
+    moved, touching = math.inf, nowhere(lattice.touch)
     for n in range(first, last):
         old, new = states[n % len(states)], states[(n + 1) % len(states)]
         force[:] = 0.0
@@ -709,6 +713,9 @@ def advance_lattice(
                 find_near(old, lattice, rows, near)
                 moved = 0.0
             press(old, lattice, near, rows, force)
+        touching = renewed(touching, old, lattice.touch)
+        if len(touching.pairs):
+            push_apart(touching, old, lattice.touch, force)
         if lattice.mirror_axis >= 0:
             fold(force, lattice)
         speed = move(old, new, force, per_mass, lattice)
@@ -745,7 +752,7 @@ def advance_lattice_adjoint(
     rows, force = make_rows(6, 4, lattice), np.zeros((3, len(lattice.mass)), states.dtype)
     force_bar = np.zeros_like(force)
     near, per_mass = np.zeros(len(lattice.filled), np.bool_), steps_per_mass(lattice)
-    moved = math.inf
+    moved, touching = math.inf, nowhere(lattice.touch)
     for n in range(last - 1, first - 1, -1):
         old, new = states[n], states[n + 1]
         if len(lattice.ground.layers):
@@ -761,6 +768,9 @@ def advance_lattice_adjoint(
         move_adjoint(old, new, force, per_mass, lattice, state_bar, force_bar, bar)
         if lattice.mirror_axis >= 0:
             fold(force_bar, lattice)
+        touching = renewed(touching, old, lattice.touch)
+        if len(touching.pairs):
+            push_apart_adjoint(touching, old, lattice.touch, force_bar, state_bar, bar.grip)
         forces_adjoint(old, force_bar, lattice, signal[n], rows, state_bar, bar, signal_bar[n])
         if len(lattice.ground.layers):
             press_adjoint(old, force_bar, lattice, near, rows, state_bar, bar)

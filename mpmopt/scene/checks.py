@@ -208,6 +208,8 @@ def check_formulation(scene: Scene) -> None:
 def check_stability(scene: Scene) -> None:
     for region in scene.body:
         limit = scene.material_of(region).largest_time_step(scene.grid.dx)
+        if scene.formulation == "total":
+            limit = scene.largest_time_step_of(scene.material_of(region))
         if scene.time_step <= limit:
             continue
         raise SceneError(

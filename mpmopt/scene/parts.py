@@ -143,16 +143,17 @@ class Material(Checked):
         """Stiffness 2 (lambda + mu) that an isolated particle at rest bounds the time step by."""
         return 2.0 * (self.lame_mu + self.lame_lambda)
 
-    def largest_time_step(self, dx: float, layer: float = 0.0) -> float:
+    def largest_time_step(self, dx: float, layer: float = 0.0, least: float = 0.0) -> float:
         """Stability limit of an isolated particle at rest on cells of width dx.
 
         dt = k / (a + sqrt(a^2 + 1)) with k = dx sqrt(rho / M) and a = k eta / (rho dx^2) (docs:
         theory, "Step control"). A contact layer, whose stiffness over its thickness is `layer`,
-        adds layer / (4 rho) to 1 / k^2. The lightest particle counts: a void one where the void
-        density is below the void stiffness.
+        adds layer / (4 rho) to 1 / k^2. M is `modulus`, or `least` where that is more. The lightest
+        particle counts: a void one where the void density is below the void stiffness.
         """
         stiffest = max(1.0, self.void_stiffness / self.void_density)
-        elastic = dx * math.sqrt(self.density / ((self.modulus + 0.25 * layer * dx**2) * stiffest))
+        modulus = max(self.modulus, least) + 0.25 * layer * dx**2
+        elastic = dx * math.sqrt(self.density / (modulus * stiffest))
         viscous = elastic * self.viscosity * stiffest / (self.density * dx**2)
         return elastic / (viscous + math.sqrt(viscous**2 + 1.0))
 

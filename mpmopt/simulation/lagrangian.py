@@ -12,7 +12,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from mpmopt import kernels
 from mpmopt.errors import DesignError, SimulationError
-from mpmopt.kernels import lagrangian
+from mpmopt.kernels import lagrangian, pairs
 from mpmopt.scene.parts import Vector
 from mpmopt.simulation.buffers import Memory
 from mpmopt.simulation.checkpoints import Checkpointing, Checkpoints, Schedule
@@ -66,6 +66,9 @@ class LagrangianSimulation(Simulation):
         alike = bool(np.all(constants == constants[:, :1]))
         mass = self._weights[0].T @ of_particles(self.data.mass)
         axis = self._mirror_axis(high)
+        grip, self._grip_slope = pairs.grips(
+            of_particles(self.data.stiffness), constants[0] + 2.0 * constants[1], dx / per_cell, dx
+        )
         self.lattice = lagrangian.Lattice(
             dt=scene.time_step,
             dx=dx,
@@ -88,6 +91,7 @@ class LagrangianSimulation(Simulation):
             active=np.any(actuated, axis=(0, 2)),
             actuation_stress=self.data.actuation_stress,
             mass=self._folded(mass, axis, columns, width),
+            touch=self._touch(cell, place, low, high, grip),
             ground=self.parameters.ground,
             nodes_y=self.parameters.nodes_y,
             nodes_x=self.parameters.nodes_x,
@@ -106,6 +110,48 @@ class LagrangianSimulation(Simulation):
             k = scene.mirror.normal
             high[k] = min(high[k], round(scene.mirror.position / dx))
         return low, high
+
+    def _touch(
+        self,
+        cell: NDArray[np.int64],
+        place: NDArray[np.int64],
+        low: NDArray[np.int64],
+        high: NDArray[np.int64],
+        grip: NDArray,
+    ) -> pairs.Touch:
+        """What of the body may touch the rest of it, from the particles' places and grips (N,)."""
+        mirror, dx, per_cell = self.scene.mirror, self.scene.grid.dx, self.scene.particles_per_cell
+        columns, rows = (int(cells) for cells in high - low)
+        width = self.nodes // (rows + 2)
+        self._seat = cell[:, 0] * rows + cell[:, 1], place[:, 0] * per_cell + place[:, 1]
+        grips = np.zeros((columns * rows, per_cell**2), grip.dtype)
+        grips[self._seat] = grip
+        cells = np.nonzero(np.any(grips.real > 0.0, axis=1))[0]
+        corner = np.stack(np.divmod(np.arange(columns * rows), rows), axis=1)
+        first = corner @ [1, width]
+        offset = np.add.outer(np.arange(3), width * np.arange(3)).ravel()
+        nodes = np.zeros(self.nodes)
+        nodes[np.add.outer(first[cells], offset)] = 1.0
+        image, axis = corner.copy(), -1
+        if mirror is not None:
+            axis = mirror.normal
+            line = round(mirror.position / dx) - int(low[axis])
+            image[:, axis] = 2 * line - 1 - image[:, axis]
+        values = lagrangian.weights(per_cell, dx)[:, :3]
+        return pairs.Touch(
+            dx=dx,
+            per_cell=per_cell,
+            axis=axis,
+            plane=0.0 if mirror is None else mirror.position,
+            corner=np.concatenate([corner, image]),
+            first=first,
+            offset=offset,
+            weights=np.einsum("am,bn->abmn", values, values).reshape(per_cell**2, 9),
+            grip=grips,
+            cells=cells,
+            nodes=nodes,
+            alone=np.full((2, self.nodes), pairs.NOWHERE),
+        )
 
     def _mirror_axis(self, high: NDArray[np.int64]) -> int:
         """Of the plane that bounds the lattice, or -1."""
@@ -361,7 +407,8 @@ class LagrangianForward(Forward):
         volume = simulation.particles.volume
         return Gradient(
             density=volume * (simulation._weights[0] @ mass_bar),
-            stiffness=bar.stiffness.ravel()[simulation._slot],
+            stiffness=bar.stiffness.ravel()[simulation._slot]
+            + simulation._grip_slope * bar.grip[simulation._seat],
             signal=signal_bar,
             state=state_bar,
         )
