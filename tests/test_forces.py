@@ -1,6 +1,7 @@
 """The books of motions: they close, and their entries are what is known of simple motions."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from walker import slanted_legs, walker
 
 from mpmopt import kernels
 from mpmopt.__main__ import main
-from mpmopt.assess.forces import WORKS, books
+from mpmopt.assess.forces import ENERGIES, WORKS, books
 from mpmopt.design.problem import Problem
 from mpmopt.scene import Grid, Ground, Material, Mirror, Scene, Solid, Wall
 from mpmopt.scene.particles import discretise
@@ -101,6 +102,62 @@ def test_the_books_of_a_walker_close_with_the_square_of_the_step():
     assert coarse.actuation > coarse.work["actuation"].max() > coarse.work["actuation"][-1] > 0.0
     cost = coarse.actuation / (coarse.weight * abs(coarse.travel))
     assert coarse.cost_of_transport == pytest.approx(cost)
+
+
+def test_the_books_of_a_total_lagrangian_body_close():
+    total = {"formulation": "total", "walls": (), "ground": (Ground.floor(3 / 64),)}
+    coarse, fine = (books(legs(time_step=dt, **total)) for dt in (8e-4, 4e-4))
+    assert unexplained(coarse) <= 1e-3
+    assert np.abs(fine.residual).max() <= 0.35 * np.abs(coarse.residual).max()
+    for work in ("viscosity", "friction", "damping"):
+        assert coarse.work[work][-1] < -1e-3 * coarse.turnover
+        assert fine.work[work][-1] == pytest.approx(coarse.work[work][-1], rel=0.3)
+    assert not coarse.work["transfer"].any()
+    # The same body in the other formulation.
+    other = books(legs(time_step=4e-4, **{**total, "formulation": "updated"}))
+    assert fine.weight == pytest.approx(other.weight, rel=1e-12)
+    assert fine.actuation == pytest.approx(other.actuation, rel=0.2)
+    mean, expected = (found.force.mean(axis=0) for found in (fine, other))
+    assert mean[0, 1] == pytest.approx(expected[0, 1], rel=0.05)
+
+
+def falling(**changes):
+    """A block of the formulation "total" that falls onto a slope, or onto a floor."""
+    usual: dict[str, Any] = {
+        "grid": Grid((24, 16), C), "time_step": 1e-3, "steps": 200, "formulation": "total",
+        "body": (Solid((4 * C, 5 * C), (8 * C, 8 * C)),), "gravity": (0.0, -10.0),
+        "ground": (Ground.slope((6 * C, 3 * C), 15.0, friction=0.2, thickness=C),),
+        "material": Material(100.0, 100.0, viscosity=0.02),
+    }  # fmt: skip
+    scene = Scene(**{**usual, **changes})
+    return Problem(scene, halvings=0, limits=None).simulation(np.zeros(0))
+
+
+def test_forces_are_what_changes_the_momentum_of_a_lattice():
+    simulation = falling()
+    found, mass = books(simulation), simulation.data.mass.sum()
+    *_, end = simulation.node_states()
+    momentum = simulation.lattice.mass @ end[:, 2:]
+    weight = found.time[-1] * mass * np.array([0.0, -10.0])
+    given = simulation.scene.time_step * found.force.sum(axis=(0, 1)) + weight
+    assert given == pytest.approx(momentum, rel=1e-9, abs=1e-12)
+    assert np.abs(found.force[:, 0]).max() > found.weight
+    assert unexplained(found) <= 1e-3
+
+
+def test_the_books_of_a_lattice_with_a_mirror_are_those_of_the_whole():
+    floor = (Ground.floor(3.5 * C, friction=0.2, thickness=C),)
+    whole, half = (
+        books(falling(ground=floor, direction=(0.0, 1.0), mirror=mirror))
+        for mirror in (None, Mirror("x", 6 * C))
+    )
+    assert unexplained(whole) <= 1e-3
+    for name in WORKS:
+        assert half.work[name] == pytest.approx(whole.work[name], abs=1e-10 * whole.turnover)
+    for name in ENERGIES:
+        assert half.energy[name] == pytest.approx(whole.energy[name], abs=1e-10 * whole.turnover)
+    assert half.force == pytest.approx(whole.force, abs=1e-9)
+    assert half.travel == pytest.approx(whole.travel, abs=1e-12)
 
 
 def test_forces_are_what_changes_momentum():

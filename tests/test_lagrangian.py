@@ -10,10 +10,9 @@ from conftest import worst
 from walker import slanted_legs, walker
 
 from mpmopt import kernels
-from mpmopt.assess.forces import books
 from mpmopt.assess.verify import complex_step_test
 from mpmopt.design.problem import Problem
-from mpmopt.errors import DesignError, SceneError
+from mpmopt.errors import SceneError
 from mpmopt.kernels import lagrangian
 from mpmopt.scene import Actuator, Design, Grid, Material, Mirror, Scene, Solid, Wall
 from mpmopt.scene.ground import Ground
@@ -297,9 +296,7 @@ def test_the_formulation_travels_as_json():
     assert Scene.from_json(scene.to_json()) == scene
 
 
-def test_states_one_after_the_other_are_those_of_a_run_and_have_no_books():
+def test_states_one_after_the_other_are_those_of_a_run():
     simulation = free_block(steps=3)
     one_by_one = np.array(list(simulation.states()))
     assert np.array_equal(one_by_one, simulation.run(range(4)))
-    with pytest.raises(DesignError, match='"total" has no transfer to keep books of; take the'):
-        books(simulation)

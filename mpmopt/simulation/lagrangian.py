@@ -186,14 +186,18 @@ class LagrangianSimulation(Simulation):
 
     def states(self) -> Iterator[NDArray]:
         """As `Simulation.states`."""
+        yield from map(self.particle_state, self.node_states())
+
+    def node_states(self) -> Iterator[NDArray]:
+        """The states (M, 4) of the nodes after 0, 1, ... steps, one after the other."""
         states = np.zeros((2, *self.start.shape), self.start.dtype)
         pushes = np.zeros((1, self.nodes), self.start.dtype)
         states[0] = self.start
-        yield self.particle_state(self.start)
+        yield self.start
         for step in range(self.steps):
             self._advance(states, pushes, step, step + 1, step)
             states[0] = states[1]
-            yield self.particle_state(states[0])
+            yield states[0].copy()
 
     def watch(self, instants: Collection[int] = ()) -> Watched:
         """As `Simulation.watch`."""
