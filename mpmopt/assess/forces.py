@@ -95,11 +95,49 @@ class Books:
         """
         steps = len(self.force)
         starts = np.arange(min(count, steps)) * steps // min(count, steps)
+        middle = self.time[starts] + 0.5 * self.scene.time_step * np.diff(starts, append=steps)
+        return middle, *self._over(starts)
+
+    def around(self, frames: NDArray[np.integer]) -> tuple[Array, Array]:
+        """Forces and places (F, P, 2) at F instants, means from halfway to the ones beside them.
+
+        Parameters
+        ----------
+        frames : (F,) array of int
+            Increasing numbers of steps.
+        """
+        starts = np.concatenate([[0], (frames[:-1] + frames[1:] + 1) // 2])
+        # Instants that are the same step, as there are where steps are few, have its force.
+        return self._over(np.minimum(starts, len(self.force) - 1))
+
+    def rows(self, count: int = 200) -> list[dict[str, float]]:
+        """A table of as many parts of the time as `means` has.
+
+        Each has its middle; the energies, and the works done so far, at its end; and every
+        support's mean force on the body and its place.
+        """
+        time, force, place = self.means(count)
+        steps = len(self.force)
+        ends = (np.arange(len(time)) + 1) * steps // len(time)
+        rows = []
+        for n, end in enumerate(ends):
+            row = {"time": float(time[n])}
+            row |= {f"energy, {name}": float(each[end]) for name, each in self.energy.items()}
+            row |= {f"work of {name}": float(each[end]) for name, each in self.work.items()}
+            for k, support in enumerate(self.supports):
+                for what, values in (("force", force), ("place", place)):
+                    for axis, value in zip("xy", values[n, k]):
+                        row[f"{what} of {support}, {axis}"] = float(value)
+            rows.append(row)
+        return rows
+
+    def _over(self, starts: NDArray[np.integer]) -> tuple[Array, Array]:
+        """Mean forces and places of the steps from each start to the next, one at least."""
 
         def summed(values: Array) -> Array:
             return np.add.reduceat(values, starts)
 
-        lengths = np.diff(starts, append=steps)
+        lengths = np.maximum(np.diff(starts, append=len(self.force)), 1)
         there = np.isfinite(self.place)
         often = summed(there.astype(float))
         place = np.divide(
@@ -108,8 +146,7 @@ class Books:
             out=np.full(often.shape, np.nan),
             where=often > 0.0,
         )
-        middle = self.time[starts] + 0.5 * self.scene.time_step * lengths
-        return middle, summed(self.force) / lengths[:, None, None], place
+        return summed(self.force) / lengths[:, None, None], place
 
 
 def books(simulation: Simulation, progress: Callable[[], None] | None = None) -> Books:
