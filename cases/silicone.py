@@ -3,9 +3,10 @@
     python cases/silicone.py --out DIR
 
 A beam of Dragon Skin 30, whose middle is a soft core of Ecoflex 00-30 that is squeezed along it, on
-a block of Ecoflex 00-30 that is to become legs, on ground with a layer of 2 mm. The plane is a section, so masses and forces are
-those of a metre of depth: densities in kg/m^3 and stresses in Pa are those of the solid. The
-viscosity is a choice, and less than silicones have: more would need a shorter step.
+a block of Ecoflex 00-30 that is to become legs, on ground with a layer of 2 mm. The plane is a
+section, so masses and forces are those of a metre of depth: densities in kg/m^3 and stresses in Pa
+are those of the solid. The viscosity is a choice, and less than silicones have: more would need a
+shorter step.
 """
 
 import sys

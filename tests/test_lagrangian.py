@@ -12,7 +12,7 @@ from walker import slanted_legs, walker
 from mpmopt import kernels
 from mpmopt.assess.verify import complex_step_test
 from mpmopt.design.problem import Problem
-from mpmopt.errors import SceneError
+from mpmopt.errors import DesignError, SceneError
 from mpmopt.kernels import lagrangian
 from mpmopt.scene import Actuator, Design, Grid, Material, Mirror, Scene, Solid, Wall
 from mpmopt.scene.ground import Ground
@@ -289,6 +289,12 @@ def test_both_formulations_walk_alike():
 def test_what_the_formulation_cannot_do_is_said_with_the_cure(changes, says):
     with pytest.raises(SceneError, match=says):
         lattice_scene(**changes)
+
+
+def test_single_precision_is_refused():
+    problem = Problem(lattice_scene(), precision="single")
+    with pytest.raises(DesignError, match='no precision "single"; take "double"'):
+        problem.value(problem.join(0.0, 1.0, -0.3, -0.5))
 
 
 def test_the_formulation_travels_as_json():

@@ -32,6 +32,10 @@ class LagrangianSimulation(Simulation):
         super().__init__(*args, **kwargs)
         if len(args) > 5 or kwargs.get("state") is not None:
             raise DesignError("the total Lagrangian formulation begins at rest; give no state")
+        if self.initial.real.dtype == np.float32:
+            raise DesignError(
+                'the total Lagrangian formulation has no precision "single"; take "double"'
+            )
         scene, particles = self.scene, self.particles
         per_cell, dx = scene.particles_per_cell, scene.grid.dx
         count, dtype = len(particles.position), self.initial.dtype
