@@ -182,15 +182,15 @@ def forces(path: Path, out: Path | None, force: bool) -> int:
     run = _read(path).run
     folder = out or path.parent
     names = ("forces.csv", "forces.png", "forces_motion.png")
-    values, picture, motion = files = [folder / name for name in names]
+    table, picture, pictures = files = [folder / name for name in names]
     refuse_existing(files if out else (), force)
     body = post_processed(run.problem(), run.result.x)
     with Progress("steps", body.simulation.steps) as progress:
         found = books(body.simulation, progress.step)
     make_folder(folder)
-    replace_file(values, as_csv(found.rows()).encode())
+    replace_file(table, as_csv(found.rows()).encode())
     plot_forces(picture, body.name, found)
-    plot_motion(motion, body, books=found)
+    plot_motion(pictures, body, books=found)
     _, borne, _ = found.means(100)
     sizes = np.hypot(*np.moveaxis(borne, -1, 0))
     print(f"{'travel':<24} {digits(found.travel)}, of the centre of mass")

