@@ -40,7 +40,18 @@ from mpmopt.optimisation.history import Optimisation
 from mpmopt.optimisation.loop import go_on, optimise
 from mpmopt.optimisation.settings import Settings, Stage
 from mpmopt.results import runfile
-from mpmopt.scene import Actuator, Design, Grid, Material, Mirror, Scene, Solid, Wall
+from mpmopt.scene import (
+    Actuator,
+    Clamp,
+    Design,
+    Grid,
+    Ground,
+    Material,
+    Mirror,
+    Scene,
+    Solid,
+    Wall,
+)
 
 MEMORY = 4 * 10**9  # bytes of address space above what a process has when it starts
 SECONDS = 60  # of one input
@@ -72,11 +83,12 @@ ODD_NUMBERS = [
     10**12, 2**63, 2**64, 10**400, 10**5000, math.nan, math.inf, -math.inf, 0.1 + 0.2, 1 / 3,
 ]  # fmt: skip
 ODD_VALUES: list[Any] = [
-    *ODD_NUMBERS, None, True, False, "", "x", "stick", "below", "\ud800", "1", "1e5", [], {}, [1],
-    [1, 2, 3], [[1, 2], [3, 4]], [[]], {"a": 1}, [None, None], ["x", "y"], [math.nan, 0.0],
-    [1e308, 1e308], [10**9, 10**9], 1000 * [0.0], "x" * 10000,
+    *ODD_NUMBERS, None, True, False, "", "x", "stick", "below", "total", "\ud800", "1", "1e5",
+    [], {}, [1], [1, 2, 3], [[1, 2], [3, 4]], [[]], {"a": 1}, [None, None], ["x", "y"],
+    [math.nan, 0.0], [1e308, 1e308], [10**9, 10**9], 1000 * [0.0], "x" * 10000,
 ]  # fmt: skip
 PARTS = {"grid": Grid, "material": Material, "mirror": Mirror}
+TUPLES: dict[str, type] = {"walls": Wall, "ground": Ground, "clamps": Clamp}
 KINDS = {part.kind: part for part in (Design, Solid, Actuator)}
 
 
@@ -119,16 +131,33 @@ def plausible(draw: Any) -> dict[str, Any]:
         "void_density": draw(st.sampled_from([1e-2, 1e-2, 1e-3, 1.0])),
     }
     walls = []
-    if draw(st.booleans()) and not mirrored:
+    standing = draw(st.sampled_from(["wall", "ground", "nothing"]))
+    if standing == "wall" and not mirrored:
         friction = draw(st.sampled_from(["stick", 0.0, 0.3, 1e6]))
         walls.append({"axis": "y", "position": dx, "solid_side": "below", "friction": friction})
     light = max(1.0, material["void_stiffness"] / material["void_density"])
     stiffness = 2.0 * light * (mu + material["lame_lambda"]) / material["density"]
     courant = draw(st.sampled_from([0.1, 0.5, 0.9, 1.0 - 1e-9]))
     time_step = courant * dx / math.sqrt(stiffness)
+    viscous = draw(st.sampled_from([0.0, 0.0, 1e-3, 0.1, 3.0]))  # a of `largest_time_step`
+    time_step /= viscous + math.sqrt(viscous**2 + 1.0)
+    material["viscosity"] = viscous * material["density"] * dx * math.sqrt(stiffness) / light
+    for region in body:
+        if draw(st.integers(0, 3)) == 0:
+            heavier = draw(st.sampled_from([1.0, 2.0, 10.0]))
+            region["material"] = {**material, "density": heavier * material["density"]}
     strength = draw(st.sampled_from([0.0, 1e-5, 1e-3, 1e-2, 10.0]))  # dx per step and step
     gravity = 0.0 if mirrored else -strength * dx / time_step**2
     steps = draw(st.integers(1, 20))
+    ground = []
+    if standing == "ground":
+        ground = draw(grounds(dx, bottom * dx / per_cell, mirrored))
+    clamps = []
+    if draw(st.integers(0, 3)) == 0:
+        clamps = [draw(clamp(dx, time_step, mirrored))]
+    blend_time = draw(st.sampled_from([0.0, 0.0, 2.0, 1e9])) * time_step
+    total = not (walls or clamps or blend_time) and draw(st.booleans())
+    time_step *= 0.7 if total else 1.0
     return {
         "grid": {"cells": list(cells), "dx": dx},
         "time_step": time_step,
@@ -136,6 +165,9 @@ def plausible(draw: Any) -> dict[str, Any]:
         "transient": draw(st.integers(0, steps - 1)) * time_step,
         "body": body,
         "walls": walls,
+        "ground": ground,
+        "clamps": clamps,
+        "formulation": "total" if total else "updated",
         "material": material,
         "gravity": [draw(st.sampled_from([0.0, 0.1])) * gravity, gravity],
         "direction": [1.0, 0.0] if mirrored or draw(st.booleans()) else [0.6, -0.8],
@@ -143,6 +175,41 @@ def plausible(draw: Any) -> dict[str, Any]:
         "filter_length": draw(st.sampled_from([0.0, dx])),
         "mirror": {"axis": "y", "position": 3 * dx} if mirrored else None,
     }
+
+
+@st.composite
+def grounds(draw: Any, dx: float, bottom: float, mirrored: bool) -> list[dict[str, Any]]:
+    """Ground below a height, level or rough; before a mirror at 3 dx the same above."""
+    thickness = draw(st.sampled_from([0.5, 1.0, 2.0])) * dx
+    y = bottom - draw(st.sampled_from([0.0, 0.3, 1.0])) * thickness
+    count = draw(st.integers(2, 5))
+    points = [[4.0 * k * dx, y - draw(st.integers(0, 2)) * dx / 3] for k in range(count)]
+    below = {
+        "points": points,
+        "friction": draw(st.sampled_from(["stick", 0.0, 0.5, 1e6])),
+        "thickness": draw(st.sampled_from([thickness, thickness, None])),
+        "stiffness": None,
+        "damping": draw(st.sampled_from([None, 0.0, 1.0])),
+        "creeping_speed": None,
+    }
+    if not mirrored:
+        return [below]
+    above = {**below, "points": [[x, 6 * dx - height] for x, height in points[::-1]]}
+    return [below, above]
+
+
+@st.composite
+def clamp(draw: Any, dx: float, time_step: float, mirrored: bool) -> dict[str, Any]:
+    """A rectangle that is held, or moves by a tenth of a cell a step at most."""
+    half = draw(st.sampled_from([0.5, 1.0, 2.5]))
+    height = 3.0 if mirrored else draw(st.integers(2, 5))
+    path, x, y = [], 0.0, 0.0
+    for k in range(draw(st.sampled_from([0, 0, 1, 3]))):
+        x += draw(st.sampled_from([0.0, 0.2])) * dx
+        y += 0.0 if mirrored else draw(st.sampled_from([-0.1, 0.1])) * dx
+        path.append([4.0 * k * time_step, [x, y]])
+    lower, upper = (height - half) * dx, (height + half) * dx
+    return {"lower": [dx, lower], "upper": [draw(st.integers(2, 4)) * dx, upper], "path": path}
 
 
 def places(data: Any, path: tuple = ()) -> list[tuple]:
@@ -231,7 +298,10 @@ def _made(part: Any, data: Any) -> Any:
 def _region(data: Any) -> Any:
     if not isinstance(data, dict) or data.get("kind") not in list(KINDS):
         return data
-    return _made(KINDS[data["kind"]], {k: v for k, v in data.items() if k != "kind"})
+    values = {k: v for k, v in data.items() if k != "kind"}
+    if "material" in values:
+        values["material"] = _made(Material, values["material"])
+    return _made(KINDS[data["kind"]], values)
 
 
 def from_objects(data: dict[str, Any]) -> Scene:
@@ -241,8 +311,9 @@ def from_objects(data: dict[str, Any]) -> Scene:
         data[name] = _made(part, data[name])
     if isinstance(data["body"], list):
         data["body"] = tuple(_region(item) for item in data["body"])
-    if isinstance(data["walls"], list):
-        data["walls"] = tuple(_made(Wall, item) for item in data["walls"])
+    for name, part in TUPLES.items():
+        if isinstance(data[name], list):
+            data[name] = tuple(_made(part, item) for item in data[name])
     return Scene(**data)
 
 

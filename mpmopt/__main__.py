@@ -57,7 +57,14 @@ def plot(path: Path, out: Path | None, force: bool) -> int:
     return 0
 
 
-def film(path: Path, out: Path | None, mp4: bool, seconds: float | None, force: bool) -> int:
+def film(
+    path: Path,
+    out: Path | None,
+    mp4: bool,
+    seconds: float | None,
+    forces: bool,
+    force: bool,
+) -> int:
     """Write a film of a run's design, the same without grey, and the solid reference design."""
     from mpmopt.io.files import make_folder, refuse_existing
     from mpmopt.view.film import film as filmed
@@ -68,7 +75,7 @@ def film(path: Path, out: Path | None, mp4: bool, seconds: float | None, force: 
     target = out or path.parent / ("film.mp4" if mp4 else "film.gif")
     refuse_existing([target] if out else (), force)
     make_folder(target.parent)
-    print(f"{target}: {filmed(target, run, seconds)}")
+    print(f"{target}: {filmed(target, run, seconds, forces)}")
     return 0
 
 
@@ -166,24 +173,29 @@ def study(path: Path) -> int:
 
 
 def forces(path: Path, out: Path | None, force: bool) -> int:
-    """Print what drives and bears a run's best design, without grey, and draw it over time."""
+    """Print, write and draw what drives and bears a run's best design, without grey."""
     import numpy as np
 
+    from mpmopt.app.sweeps import as_csv
     from mpmopt.assess.forces import books
     from mpmopt.assess.trajectory import post_processed
-    from mpmopt.io.files import make_folder, refuse_existing
+    from mpmopt.io.files import make_folder, refuse_existing, replace_file
     from mpmopt.io.progress import Progress
     from mpmopt.validation import digits
-    from mpmopt.view.plot import plot_forces
+    from mpmopt.view.plot import plot_forces, plot_motion
 
     run = _read(path).run
-    picture = (out or path.parent) / "forces.png"
-    refuse_existing([picture] if out else (), force)
+    folder = out or path.parent
+    names = ("forces.csv", "forces.png", "forces_motion.png")
+    table, picture, pictures = files = [folder / name for name in names]
+    refuse_existing(files if out else (), force)
     body = post_processed(run.problem(), run.result.x)
     with Progress("steps", body.simulation.steps) as progress:
         found = books(body.simulation, progress.step)
-    make_folder(picture.parent)
+    make_folder(folder)
+    replace_file(table, as_csv(found.rows()).encode())
     plot_forces(picture, body.name, found)
+    plot_motion(pictures, body, books=found)
     _, borne, _ = found.means(100)
     sizes = np.hypot(*np.moveaxis(borne, -1, 0))
     print(f"{'travel':<24} {digits(found.travel)}, of the centre of mass")
@@ -197,7 +209,7 @@ def forces(path: Path, out: Path | None, force: bool) -> int:
         mean = ", ".join(digits(value) for value in borne[:, k].mean(axis=0))
         peak = digits(float(sizes[:, k].max()))
         print(f"{'force of ' + name:<24} mean ({mean}), at most {peak} over 1 % of the time")
-    print(picture)
+    print(*files, sep="\n")
     return 0
 
 
@@ -335,6 +347,10 @@ def _parser() -> argparse.ArgumentParser:
         "out/walker/run.h5",
         "out/walker/run.h5 --mp4",
         "out/walker/run.h5 --seconds 12 --out walker.gif",
+        "out/walker/run.h5 --forces",
+    )
+    command.add_argument(
+        "--forces", action="store_true", help="arrows: what ground and walls push bodies with"
     )
     command.add_argument("--mp4", action="store_true", help="film.mp4 instead of film.gif")
     add_place(command, "FILE", "ends in .gif or .mp4 (default: film.gif there)")
@@ -382,7 +398,8 @@ def _parser() -> argparse.ArgumentParser:
         "say what drives and bears its best design",
         "Keep the books of the best design, without void: the work of actuators, viscosity,\n"
         "ground, walls and numerics, the cost of transport (actuators' work over weight and\n"
-        "travel), and the forces of ground and walls. forces.png shows them over time.",
+        "travel), and the forces of ground and walls. forces.csv and forces.png have them over\n"
+        "time, forces_motion.png as arrows.",
         "out/walker/run.h5",
         "out/walker/run.h5 --out pictures",
     )

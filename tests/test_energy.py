@@ -16,11 +16,12 @@ from mpmopt.assess.verify import COMPLEX_STEP
 from mpmopt.design.problem import Problem, Variables
 from mpmopt.design.step_control import LIMITS
 from mpmopt.errors import DesignError, FractureError, SimulationError
-from mpmopt.scene import Actuator, Grid, Scene, Solid, Wall
+from mpmopt.scene import Actuator, Clamp, Grid, Scene, Solid, Wall
 from mpmopt.scene.particles import discretise
 from mpmopt.simulation import energy
 from mpmopt.simulation.checkpoints import Checkpointing
 from mpmopt.simulation.simulation import Simulation
+from mpmopt.simulation.surroundings import parameters_of
 
 
 def totals(simulation, state):
@@ -116,6 +117,37 @@ def test_the_balance_is_the_same_for_every_schedule_and_for_complex_numbers():
             assert simulation.forward(checkpoints).indicators == expected
     complex_one = problem.simulation(x + 1j * COMPLEX_STEP)
     assert margin(complex_one) == pytest.approx(margin(problem.simulation(x)), abs=1e-12)
+
+
+def test_a_clamp_that_moves_may_raise_energy_but_one_at_rest_may_not(monkeypatch):
+    # Shaken for 128 steps and then held. What appears is told after every look.
+    c = 1 / 16
+    path = tuple((k * 8e-3, (0.5 * c * (k % 2), 0.0)) for k in range(33))
+    scene = Scene(
+        Grid((24, 16), c), time_step=2e-3, steps=512,
+        body=(Solid((4 * c, 6 * c), (12 * c, 8 * c)),),
+        clamps=(Clamp((3 * c, 5 * c), (7 * c, 9 * c), path),),
+    )  # fmt: skip
+    assert not parameters_of(scene).clamps[128:, :, 4:].any()
+    simulation = Problem(scene).simulation(np.zeros(0))
+    found: list[float] = []
+    assert margin(simulation) <= 1e-3
+    real = energy.energy
+
+    def false(first):
+        """Energy that appears once, from a look on."""
+        found.clear()
+
+        def told(*arguments):
+            kinetic, potential = real(*arguments)
+            found.append(kinetic)
+            return kinetic + 10.0 * max(found) * (len(found) > first), potential
+
+        monkeypatch.setattr(energy, "energy", told)
+        return margin(simulation)
+
+    assert false(1) <= 1e-3
+    assert false(4) >= 1.0
 
 
 @pytest.mark.parametrize(("courant", "least", "most"), [(0.8, 0.0, 1e-6), (1.2, 0.5, np.inf)])

@@ -67,6 +67,16 @@ def test_a_gif_has_the_frames_that_were_asked_for_and_they_are_the_screens(short
         assert difference.mean() <= 2.0
 
 
+def test_a_film_with_forces_has_arrows(short_run, tmp_path):
+    for name, forces in (("plain.gif", False), ("forces.gif", True)):
+        film(tmp_path / name, short_run, seconds=0.2, forces=forces)
+    plain, pushed = (gif(tmp_path / name)[0] for name in ("plain.gif", "forces.gif"))
+    assert len(plain) == len(pushed) == 5
+    shown = Screen(motions(short_run, 5), 1.0).frame(0).shape
+    assert plain[0].shape == shown
+    assert pushed[0].shape != shown or np.abs(plain - pushed).max() > 100
+
+
 def test_bodies_are_where_their_particles_are_and_move(short_run):
     shown = motions(short_run, 5)
     screen = Screen(shown, 1.0)

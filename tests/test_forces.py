@@ -1,6 +1,8 @@
 """The books of motions: they close, and their entries are what is known of simple motions."""
 
+import csv
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,10 +12,14 @@ from walker import slanted_legs, walker
 
 from mpmopt import kernels
 from mpmopt.__main__ import main
-from mpmopt.assess.forces import WORKS, books
+from mpmopt.assess.forces import ENERGIES, WORKS, books
+from mpmopt.assess.trajectory import Body, Motion, equal_steps
 from mpmopt.design.problem import Problem
+from mpmopt.design.terms import Displacement
 from mpmopt.scene import Grid, Ground, Material, Mirror, Scene, Solid, Wall
 from mpmopt.scene.particles import discretise
+from mpmopt.view.draw import Arrows, Forces, new_figure, view
+from mpmopt.view.film import Screen
 
 C = 1 / 16
 
@@ -103,6 +109,62 @@ def test_the_books_of_a_walker_close_with_the_square_of_the_step():
     assert coarse.cost_of_transport == pytest.approx(cost)
 
 
+def test_the_books_of_a_total_lagrangian_body_close():
+    total = {"formulation": "total", "walls": (), "ground": (Ground.floor(3 / 64),)}
+    coarse, fine = (books(legs(time_step=dt, **total)) for dt in (8e-4, 4e-4))
+    assert unexplained(coarse) <= 1e-3
+    assert np.abs(fine.residual).max() <= 0.35 * np.abs(coarse.residual).max()
+    for work in ("viscosity", "friction", "damping"):
+        assert coarse.work[work][-1] < -1e-3 * coarse.turnover
+        assert fine.work[work][-1] == pytest.approx(coarse.work[work][-1], rel=0.3)
+    assert not coarse.work["transfer"].any()
+    # The same body in the other formulation.
+    other = books(legs(time_step=4e-4, **{**total, "formulation": "updated"}))
+    assert fine.weight == pytest.approx(other.weight, rel=1e-12)
+    assert fine.actuation == pytest.approx(other.actuation, rel=0.2)
+    mean, expected = (found.force.mean(axis=0) for found in (fine, other))
+    assert mean[0, 1] == pytest.approx(expected[0, 1], rel=0.05)
+
+
+def falling(**changes):
+    """A block of the formulation "total" that falls onto a slope, or onto a floor."""
+    usual: dict[str, Any] = {
+        "grid": Grid((24, 16), C), "time_step": 1e-3, "steps": 200, "formulation": "total",
+        "body": (Solid((4 * C, 5 * C), (8 * C, 8 * C)),), "gravity": (0.0, -10.0),
+        "ground": (Ground.slope((6 * C, 3 * C), 15.0, friction=0.2, thickness=C),),
+        "material": Material(100.0, 100.0, viscosity=0.02),
+    }  # fmt: skip
+    scene = Scene(**{**usual, **changes})
+    return Problem(scene, halvings=0, limits=None).simulation(np.zeros(0))
+
+
+def test_forces_are_what_changes_the_momentum_of_a_lattice():
+    simulation = falling()
+    found, mass = books(simulation), simulation.data.mass.sum()
+    *_, end = simulation.node_states()
+    momentum = simulation.lattice.mass @ end[:, 2:]
+    weight = found.time[-1] * mass * np.array([0.0, -10.0])
+    given = simulation.scene.time_step * found.force.sum(axis=(0, 1)) + weight
+    assert given == pytest.approx(momentum, rel=1e-9, abs=1e-12)
+    assert np.abs(found.force[:, 0]).max() > found.weight
+    assert unexplained(found) <= 1e-3
+
+
+def test_the_books_of_a_lattice_with_a_mirror_are_those_of_the_whole():
+    floor = (Ground.floor(3.5 * C, friction=0.2, thickness=C),)
+    whole, half = (
+        books(falling(ground=floor, direction=(0.0, 1.0), mirror=mirror))
+        for mirror in (None, Mirror("x", 6 * C))
+    )
+    assert unexplained(whole) <= 1e-3
+    for name in WORKS:
+        assert half.work[name] == pytest.approx(whole.work[name], abs=1e-10 * whole.turnover)
+    for name in ENERGIES:
+        assert half.energy[name] == pytest.approx(whole.energy[name], abs=1e-10 * whole.turnover)
+    assert half.force == pytest.approx(whole.force, abs=1e-9)
+    assert half.travel == pytest.approx(whole.travel, abs=1e-12)
+
+
 def test_forces_are_what_changes_momentum():
     simulation = block(
         (2.0, -1.0), walls=(Wall("y", 4 * C, friction=0.3), Wall("x", 10 * C, "above"))
@@ -156,9 +218,77 @@ def test_both_halves_of_a_body_with_a_mirror_are_in_its_books():
     assert half.place == pytest.approx(whole.place, abs=1e-9, nan_ok=True)
 
 
+def test_forces_around_instants_are_those_of_the_steps_nearest_to_them():
+    found = books(block(steps=60, gap=C, ground=ground()))
+    force, place = found.around(np.array([0, 20, 30, 60]))
+    for k, (first, last) in enumerate([(0, 10), (10, 25), (25, 45), (45, 60)]):
+        assert force[k] == pytest.approx(found.force[first:last].mean(axis=0), rel=1e-12)
+        there = found.place[first:last][np.isfinite(found.place[first:last, 0, 0])]
+        expected = there.mean(axis=0) if len(there) else np.full((1, 2), np.nan)
+        assert place[k] == pytest.approx(expected, rel=1e-12, nan_ok=True)
+    assert np.isnan(place[0]).all() and np.isfinite(place[3]).all()
+    # More instants than steps, and all of them as in the means.
+    often, _ = found.around(np.rint(np.linspace(0, 60, 200)).astype(int))
+    assert often[[0, -1]] == pytest.approx(found.force[[0, -1]], abs=1e-14)
+
+
+def test_the_table_of_forces_ends_with_all_that_was_done():
+    found = books(block(velocity=(2.0, 0.0), steps=100, ground=ground()))
+    rows = found.rows(10)
+    assert len(rows) == 10
+    _, force, place = found.means(10)
+    for n, row in enumerate(rows):
+        assert row["time"] == pytest.approx(found.time[10 * n + 5])
+        for name, values in found.work.items():
+            assert row[f"work of {name}"] == values[10 * n + 10]
+        for name, values in found.energy.items():
+            assert row[f"energy, {name}"] == values[10 * n + 10]
+        given = [row[f"{what} of ground 0, {k}"] for what in ("force", "place") for k in "xy"]
+        assert given == pytest.approx([*force[n, 0], *place[n, 0]], nan_ok=True)
+
+
+def test_arrows_end_where_forces_act_and_are_as_long_as_these_are():
+    simulation = block(velocity=(2.0, 0.0), gap=0.65 * C, steps=100, ground=ground())
+    found, count = books(simulation), simulation.initial.shape[1]
+    body = Body("block", simulation, np.ones(count), Displacement(), np.ones(0))
+    motion = Motion.of(body, equal_steps(simulation.scene, 6))
+    forces = Forces.of([motion], [found])
+    (force, place), *others = forces.values
+    assert not others
+    assert forces.largest == pytest.approx(np.hypot(*force[:, 0].T).max())
+    seen = view([motion])
+    width = np.ptp(seen, axis=0).max()
+    assert forces.scale * forces.largest == pytest.approx(0.15 * width)
+    axes = new_figure(3.0, 3.0).add_subplot()
+    arrows = Arrows(axes, force, place, forces.scale)
+    shown = 0
+    for k in range(6):
+        arrows.show(k)
+        (patch,) = arrows.patches
+        assert patch.get_visible() == bool(np.isfinite(place[k]).all())
+        if patch.get_visible():
+            tail, tip = vars(patch)["_posA_posB"]
+            assert tip == pytest.approx(place[k, 0])
+            assert np.subtract(tip, tail) == pytest.approx(forces.scale * force[k, 0])
+            assert np.all((forces.box[0] <= tail) & (tail <= forces.box[1]))
+            shown += 1
+    assert shown >= 4
+    hidden = replace(found, place=np.full_like(found.place, np.nan))
+    bare, pushed = (Screen([motion], 1.0, [each]).frame(5) for each in (hidden, found))
+    assert bare.shape == pushed.shape
+    changed = np.argwhere((bare != pushed).any(axis=2))
+    assert len(changed) >= 40
+    assert (pushed[tuple(changed.T)] < 60).all(axis=1).mean() >= 0.2  # black, and its edges
+
+
 def test_forces_of_a_run_are_told_and_drawn(short_path, tmp_path, capsys):
     assert main(["forces", str(short_path), "--out", str(tmp_path)]) == 0
     printed = capsys.readouterr().out
-    assert (tmp_path / "forces.png").stat().st_size > 10_000
+    for name in ("forces.png", "forces_motion.png"):
+        assert (tmp_path / name).stat().st_size > 10_000
+    with (tmp_path / "forces.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 40  # as many as there are steps
+    assert {"time", "work of walls", "force of walls, y", "place of walls, x"} <= set(rows[0])
     for what in (*(f"work of {name}" for name in WORKS), "cost of transport", "force of walls"):
         assert what in printed

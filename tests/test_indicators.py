@@ -15,7 +15,7 @@ from mpmopt.design.step_control import LIMITS
 from mpmopt.errors import DesignError, FractureError, SimulationError
 from mpmopt.optimisation.loop import optimise
 from mpmopt.optimisation.settings import Settings, Stage
-from mpmopt.scene import Actuator, Design, Material, Solid, Wall
+from mpmopt.scene import Actuator, Design, Ground, Material, Solid, Wall
 from mpmopt.simulation.checkpoints import Checkpointing
 from mpmopt.simulation.indicators import WATCH, Indicators
 
@@ -45,6 +45,20 @@ def watched(scene, particles, states, mass, share):
             if share[p] >= 0.5:
                 stretch.append(float(np.linalg.norm(F, 2)))
     return Indicators(max(courant), max(velocity_increment), min(jacobian), max(stretch))
+
+
+def test_a_layer_is_in_the_courant_number_of_what_is_in_it(scene):
+    # Stiffer than its body, so that it counts; the lowest particles are in it, or they are not.
+    layer = {"thickness": CELL, "stiffness": 1e5}
+    for below, within in ((0.5, True), (0.7, True), (0.8, False), (3.0, False)):
+        floor = Ground.floor((4 - below) * CELL, **layer)
+        standing = dataclasses.replace(scene, walls=(), ground=(floor,)).vary(void_density=1e-3)
+        problem = Problem(standing, halvings=0, limits=None)
+        simulation = problem.simulation(problem.join(1.0, 0.0, 0.0, 0.0))
+        courant = simulation.indicators(kernels.grouped(simulation.initial)).courant
+        limit = standing.largest_time_step if within else standing.material.largest_time_step(CELL)
+        assert courant == pytest.approx(standing.time_step / limit, rel=1e-12)
+    assert standing.largest_time_step < 0.9 * standing.material.largest_time_step(CELL)
 
 
 def lively(**changes):

@@ -11,7 +11,6 @@ from conftest import worst
 from walker import slanted_legs, walker
 
 from mpmopt import kernels
-from mpmopt.assess.forces import books
 from mpmopt.assess.verify import complex_step_test
 from mpmopt.design.problem import Problem
 from mpmopt.errors import DesignError, SceneError
@@ -359,14 +358,18 @@ def test_what_the_formulation_cannot_do_is_said_with_the_cure(changes, says):
         lattice_scene(**changes)
 
 
+def test_single_precision_is_refused():
+    problem = Problem(lattice_scene(), precision="single")
+    with pytest.raises(DesignError, match='no precision "single"; take "double"'):
+        problem.value(problem.join(0.0, 1.0, -0.3, -0.5))
+
+
 def test_the_formulation_travels_as_json():
     scene = lattice_scene()
     assert Scene.from_json(scene.to_json()) == scene
 
 
-def test_states_one_after_the_other_are_those_of_a_run_and_have_no_books():
+def test_states_one_after_the_other_are_those_of_a_run():
     simulation = free_block(steps=3)
     one_by_one = np.array(list(simulation.states()))
     assert np.array_equal(one_by_one, simulation.run(range(4)))
-    with pytest.raises(DesignError, match='"total" has no transfer to keep books of; take the'):
-        books(simulation)

@@ -161,7 +161,7 @@ def test_scenes_of_several_materials_go_to_json_and_back():
 
 
 def test_a_silicone_robot_moves_in_metres_and_seconds():
-    # Half a second on cells of 2 mm: it stands on its floor and goes some millimetres.
+    # Half a second on cells of 2 mm: it stands in the layer, 6 to 8 mm, and goes some millimetres.
     scene = silicone_walker()
     assert 0.5 < scene.time_step / scene.largest_time_step < 1.0
     particles = discretise(scene)
@@ -173,6 +173,6 @@ def test_a_silicone_robot_moves_in_metres_and_seconds():
     assert run.indicators.courant < 1.0
     assert run.indicators.stretch < 2.0
     end = run.states[scene.steps]
-    assert 7e-3 < end[1].min() < 9e-3
+    assert 6e-3 < end[1].min() < 8e-3
     gone = (end[0] - body.initial[0])[~body.particles.designed].mean()
     assert 1e-3 < abs(gone) < 2e-2

@@ -5,16 +5,19 @@ import csv
 import mesh_independence
 import numpy as np
 import pytest
-from mesh_independence import CHOICES, displacement, legs
+from mesh_independence import CHOICES, displacement, stepped_legs
+from walker import slanted_legs
 
 from mpmopt.scene.particles import discretise
 
 LAYER, CLAMPED = CHOICES[:2]
 
 
-def test_the_body_is_the_same_on_all_cells():
+def test_edges_of_64_cells_are_the_same_body_on_all():
     positions = [discretise(LAYER.scene(n)) for n in (64, 128)]
-    coarse, fine = (p.position[p.designed][legs(p.position[p.designed])] for p in positions)
+    coarse, fine = (p.position[p.designed][stepped_legs(p.position[p.designed])] for p in positions)
+    drawn = positions[0].position[positions[0].designed]
+    assert np.array_equal(stepped_legs(drawn), slanted_legs(drawn))
     assert len(fine) == 4 * len(coarse)
     quarters = {tuple(q) for q in np.floor(fine * 128).astype(int)}
     assert quarters == {tuple(q) for q in np.floor(coarse * 128).astype(int)}
@@ -29,7 +32,17 @@ def test_the_choices_are_scenes_that_differ_in_what_they_say():
 
 
 def test_the_walker_moves_as_far_as_measured():
-    assert displacement(LAYER, 64)["displacement"] == pytest.approx(0.0934, abs=0.002)
+    assert displacement(LAYER, 64)["displacement"] == pytest.approx(0.0929, abs=0.002)
+
+
+def test_from_64_to_128_cells_the_walker_goes_as_far_and_does_not_where_it_falls():
+    found = {
+        name: [displacement(choice, cells)["displacement"] for cells in (64, 128)]
+        for name, choice in (("stands", LAYER), ("falls", replace(LAYER, fall=1.0)))
+    }
+    apart = {name: abs(b - a) / a for name, (a, b) in found.items()}
+    assert apart["stands"] <= 0.01
+    assert apart["falls"] >= 0.05
 
 
 def test_the_command_writes_its_tables_and_its_figure(tmp_path):

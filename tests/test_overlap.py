@@ -13,6 +13,7 @@ from mpmopt.assess.threshold import SOLID_LIMITS
 from mpmopt.design.problem import Problem
 from mpmopt.design.step_control import LIMITS, check_indicators
 from mpmopt.errors import OverlapError
+from mpmopt.kernels import plain
 from mpmopt.scene import Grid, Scene, Solid
 from mpmopt.simulation.indicators import Indicators
 
@@ -54,6 +55,22 @@ def test_the_gap_is_that_of_all_pairs(by):
     expected, places = by_hand(simulation, state)
     assert gap == pytest.approx(expected, rel=1e-12)
     assert tuple(place) in places
+
+
+@pytest.mark.parametrize("out", [(0.9, 0.0), (-0.9, 0.0), (0.1, 2.0), (0.0, -1e300)])
+def test_a_gap_beyond_the_grid_is_found_in_bounds(out):
+    # Bodies of the formulation "total" may leave it; as plain Python, indices are checked.
+    simulation = Problem(two_blocks(formulation="total")).simulation(np.empty(0))
+    right = simulation.particles.position[:, 0] > 12 * C
+    state = moved(simulation, right, (-11.9 * C, -0.1 * C))
+    kernels.parts(state).position[:] += np.array(out)[:, None]
+    solid, reference = simulation.data.mass > 0.0, simulation.particles.position.T
+    gap, *_ = plain(kernels.closest)(
+        kernels.grouped(state), kernels.grouped(reference), solid, simulation.data,
+        simulation.parameters,
+    )  # fmt: skip
+    if abs(out[1]) < 1e9:
+        assert gap == pytest.approx(by_hand(simulation, state)[0], rel=1e-9)
 
 
 def test_near_parts_of_a_body_and_far_ones_apart_have_no_gap():

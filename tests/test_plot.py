@@ -14,7 +14,7 @@ from conftest import SHORT, empty, small_scene
 from PIL import Image
 from scipy.ndimage import binary_erosion, label
 from test_mirror import channel
-from walker import walker
+from walker import walker, walker_on_ground
 
 from mpmopt.__main__ import main
 from mpmopt.app import multistart
@@ -25,7 +25,7 @@ from mpmopt.io import files
 from mpmopt.optimisation.history import Iteration
 from mpmopt.optimisation.loop import optimise
 from mpmopt.results import runfile
-from mpmopt.scene import Design, Grid, Solid
+from mpmopt.scene import Design, Grid, Ground, Solid
 from mpmopt.view import draw, plot
 from mpmopt.view.film import Screen
 from mpmopt.view.schematic import schematic
@@ -222,6 +222,22 @@ def test_a_schematic_tells_all_that_is_there():
     # 20c x 10c: along x 5c, 10c, 5c; along y 7c, 3c; with c = 1/64
     lengths = sorted(float(word) for word in shown if word.startswith("0."))
     assert np.allclose(lengths, sorted(k / 64 for k in (20, 10, 5, 10, 5, 7, 3)), rtol=1e-5)
+
+
+@pytest.mark.parametrize(("friction", "said"), [(0.35, "friction 0.35"), ("stick", "stick")])
+def test_a_schematic_tells_the_friction_of_ground_inside_it(friction, said):
+    scene = walker_on_ground(64, 8e-4, 10)
+    points = ((0.0, 3 / 64), (0.3, 3 / 64), (0.6, 1 / 64))
+    for ground in (Ground.floor(3 / 64, friction), Ground(points, friction)):
+        (axes,) = schematic(dataclasses.replace(scene, ground=(ground,))).axes
+        (label,) = [text for text in axes.texts if text.get_text() == said]
+        d, _ = ground.distance(np.array(label.get_position()))
+        assert d < 0.0
+        (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
+        x, y = label.get_position()
+        assert left < x < right and low < y < high
+    below = dataclasses.replace(scene, ground=(Ground.floor(-1.0, friction),))
+    assert said not in words(schematic(below))  # out of sight
 
 
 def test_a_schematic_of_a_channel_shows_its_mirror_and_friction():

@@ -235,6 +235,20 @@ def test_a_block_sticks_and_slides_on_an_incline_as_coulomb_says():
     assert contact.travelled("block", 2.0 * contact.STEEP) == pytest.approx(0.0, abs=0.02)
 
 
+def test_a_block_slides_on_a_layer_as_coulomb_says_and_creeps_where_it_sticks():
+    for ratio in (0.2, 0.8):
+        found = contact.travelled("block", ratio * contact.STEEP, law="layer")
+        assert found == pytest.approx(1.0 - ratio, abs=0.01)
+    found = contact.travelled("block", 2.0 * contact.STEEP, law="layer")
+    assert found == pytest.approx(0.0, abs=0.01)
+
+
+@pytest.mark.parametrize(("share", "digits"), [(0.3, 0.01), (3.0, 0.01)])
+def test_a_viscous_particle_has_the_limit_of_its_scene(share, digits):
+    row = time_step.viscous_limit("isolated particle", share, 1000)
+    assert row["measured"] == pytest.approx(row["theory"], rel=digits)
+
+
 def test_a_disc_slides_below_a_third_of_the_slope_and_rolls_above():
     for ratio in (0.0, 0.2):
         assert contact.travelled("disc", ratio * contact.STEEP) == pytest.approx(

@@ -1,6 +1,8 @@
 """What a study tells of a finished run, on numbers that are told instead of simulated."""
 
 import dataclasses
+from math import inf
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -65,6 +67,7 @@ def told(monkeypatch):
 
     monkeypatch.setattr(summary, "best_actuated", best_actuated)
     monkeypatch.setattr(summary, "study", lambda problem, x: rows)
+    monkeypatch.setattr(summary, "books", lambda simulation: SimpleNamespace(cost_of_transport=1.5))
     monkeypatch.setattr(summary, "post_processed", lambda problem, x: 0.45)
     monkeypatch.setattr(summary, "unactuated", lambda problem, x: 0.05)
 
@@ -111,6 +114,22 @@ def test_a_summary_is_of_the_best_design_and_counts_all_evaluations(told):
     }  # fmt: skip
     assert {name: summary[name] for name in wanted} == wanted
     assert summary["retained_gain"] == {name: 0.9 for name in NAMES[1:]}
+
+
+def test_a_cost_of_transport_is_that_of_the_body_without_grey(told, monkeypatch):
+    told((0.1,) * 4, (0.5,) * 4)
+    assert summarise(finished(), {})["cost_of_transport"] == 1.5
+    monkeypatch.setattr(summary, "books", lambda simulation: SimpleNamespace(cost_of_transport=inf))
+    assert summarise(finished(), {})["cost_of_transport"] is None
+
+    def count(simulation):
+        return SimpleNamespace(cost_of_transport=len(simulation.particles.position))
+
+    monkeypatch.setattr(summary, "books", count)
+    low = np.where(np.arange(32) < 8, 1.0, -1.0)
+    best = candidate(low, 0.75).x
+    there = len(PROBLEM.particles.position) - 32 + threshold.kept(PROBLEM, best).sum()
+    assert summarise(finished(low), {})["cost_of_transport"] == there
 
 
 def test_loose_particles_are_those_that_hang_on_nothing(told):

@@ -1,17 +1,18 @@
 """Contact: onset and rest of a dropped block; sticking, sliding and rolling on an incline."""
 
 import math
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from mpmopt.errors import SimulationError
-from mpmopt.scene import Grid, Material, Scene, Solid, Wall
+from mpmopt.scene import Grid, Ground, Material, Scene, Solid, Wall
 from mpmopt.scene.particles import discretise
-from stability.common import Array, Found, Line, Measured, Points, at_rest, solid
+from stability.common import Array, Found, Line, Measured, Points, Rows, at_rest, solid
 
 DX = 1.0 / 32.0
 STEEP = 0.3  # tan(alpha) of the incline
+LAWS = "wall", "layer"  # clamped nodes, and ground with a contact layer
 
 
 def dropped_block(steps: int, drop: float = 1.0) -> tuple[Array, Array]:
@@ -31,7 +32,18 @@ def dropped_block(steps: int, drop: float = 1.0) -> tuple[Array, Array]:
     return states[:, 1].min(axis=1) / DX - 2.0, free / DX - 2.0
 
 
-def travelled(shape: str, friction: float, slope: float = STEEP, cells: int = 32) -> float:
+def floor_at(
+    law: str, y: float, friction: float | Literal["stick"], thickness: float
+) -> dict[str, Any]:
+    """What a scene stands on at a height y."""
+    if law == "wall":
+        return {"walls": (Wall("y", y, friction=friction),)}
+    return {"ground": (Ground.floor(y - thickness, friction, thickness=thickness),)}
+
+
+def travelled(
+    shape: str, friction: float, slope: float = STEEP, cells: int = 32, law: str = "wall"
+) -> float:
     """Acceleration of a body along an incline, in those of a frictionless slide.
 
     Gravity is tilted, the floor is level. The body first settles under the normal part of gravity.
@@ -44,6 +56,8 @@ def travelled(shape: str, friction: float, slope: float = STEEP, cells: int = 32
         tan(alpha).
     cells : int
         In a unit of length; the block is 1/4 by 1/8, the disc has radius 0.15.
+    law : {"wall", "layer"}
+        The layer has a thickness of 1/64.
     """
     dx = 1.0 / cells
     alpha = math.atan(slope)
@@ -67,7 +81,7 @@ def travelled(shape: str, friction: float, slope: float = STEEP, cells: int = 32
             gravity=gravity,
             material=material,
             body=(Solid(*box),),
-            walls=(Wall("y", floor, friction=friction),),
+            **floor_at(law, floor, friction, 1 / 64),
         )
 
     first = scene((0.0, normal), settle)
@@ -93,8 +107,8 @@ def theory(shape: str, ratio: float) -> float:
     return 2.0 / 3.0 if ratio >= 1.0 / 3.0 else 1.0 - ratio
 
 
-def impact(speed: float, courant: float) -> dict[str, Any]:
-    """A square block thrown at a wall: how fast it comes back, in impact speeds."""
+def impact(speed: float, courant: float, law: str = "wall") -> dict[str, Any]:
+    """A square block thrown at a floor: how fast it comes back, in impact speeds."""
     wave = Material().wave_speed
     seconds = 20.0 / wave * (1.0 + 0.4 / speed)
     scene = Scene(
@@ -102,12 +116,14 @@ def impact(speed: float, courant: float) -> dict[str, Any]:
         time_step=courant / wave,
         steps=round(seconds * wave / courant),
         body=(Solid((12.0, 12.0), (20.0, 20.0)),),
-        walls=(Wall("y", 8.0),),
+        **floor_at(law, 8.0, "stick", 1.0),
     )
     particles = discretise(scene)
     state = at_rest(particles)
     state[3] = -speed * wave
-    row: dict[str, Any] = {"speed": speed, "courant": courant, "rebound": np.nan, "failure": ""}
+    row: dict[str, Any] = {
+        "law": law, "speed": speed, "courant": courant, "rebound": np.nan, "failure": "",
+    }  # fmt: skip
     try:
         end = solid(scene, particles, state).run()
         row["rebound"] = float(end[3].mean() / (speed * wave))
@@ -120,23 +136,30 @@ RATIOS = (0.0, 0.1, 0.2, 0.3, 0.4, 0.6, 0.8, 1.2, 2.0, 3.0)
 SPEEDS = (0.1, 0.2, 0.5, 1.0, 1.5, 2.0, 3.0, 5.0)
 
 
-def on_incline(shape: str, cells: int, ratio: float) -> dict[str, Any]:
+def on_incline(shape: str, cells: int, ratio: float, law: str = "wall") -> dict[str, Any]:
     """A body on the incline, in theory and as measured."""
     return {
-        "shape": shape, "cells": cells, "ratio": ratio, "theory": theory(shape, ratio),
-        "measured": travelled(shape, ratio * STEEP, cells=cells),
+        "law": law, "shape": shape, "cells": cells, "ratio": ratio,
+        "theory": theory(shape, ratio),
+        "measured": travelled(shape, ratio * STEEP, cells=cells, law=law),
     }  # fmt: skip
 
 
 def points(quick: bool) -> Points:
     """Inclines and impacts."""
     inclines = [
-        {"shape": shape, "cells": cells, "ratio": ratio}
+        {"shape": shape, "cells": cells, "ratio": ratio, "law": law}
+        for law in LAWS
         for shape in ("block", "disc")
         for cells in ((32,) if quick else (32, 64, 128))
         for ratio in (RATIOS[::3] if quick else RATIOS)
     ]
-    impacts = [{"speed": s, "courant": courant} for s in SPEEDS for courant in (0.14, 0.35)]
+    impacts = [
+        {"speed": s, "courant": courant, "law": law}
+        for law in LAWS
+        for s in SPEEDS
+        for courant in (0.14, 0.35)
+    ]
     return {on_incline: inclines, impact: impacts}
 
 
@@ -158,7 +181,19 @@ def measure(measured: Measured) -> Found:
             "Runs: the wall is half a cell soft.",
         )
     )
-    rows = found.tables["incline"] = measured[on_incline]
+    found.tables["incline"], found.tables["impact"] = measured[on_incline], measured[impact]
+    for law in LAWS:
+        inclines, impacts = (
+            [row for row in measured[function] if row["law"] == law]
+            for function in (on_incline, impact)
+        )
+        found.lines += lines(law, inclines, impacts)
+    return found
+
+
+def lines(law: str, rows: Rows, hits: Rows) -> list[Line]:
+    """What inclines and impacts of one law amount to."""
+    found, on = [], "" if law == "wall" else ", on a layer"
 
     def worst(shape: str, low: float, high: float) -> str:
         return ", ".join(
@@ -174,7 +209,7 @@ def measure(measured: Measured) -> Found:
 
     cells = ", ".join(str(n) for n in dict.fromkeys(r["cells"] for r in rows))
     unit = "of g sin(alpha)"
-    for name, law, shape, low, high, loss in (
+    for name, rigid, shape, low, high, loss in (
         ("sticking block", "a = 0 for mu_f >= tan(alpha)", "block", 1.0, 9.0, "Runs."),
         ("sliding block", "a = g (sin - mu_f cos)", "block", 0.0, 0.99, "Runs."),
         ("sliding disc", "a = g (sin - mu_f cos)", "disc", 0.0, 0.32, "Runs."),
@@ -182,21 +217,24 @@ def measure(measured: Measured) -> Found:
          "Runs: rolls too fast by a share that falls with the cells."),
     ):  # fmt: skip
         off = f"off by at most {worst(shape, low, high)} {unit} with {cells} cells"
-        found.lines.append(Line(f"Contact: {name} on an incline", law, off, loss))
-    hits = found.tables["impact"] = measured[impact]
+        found.append(Line(f"Contact: {name} on an incline{on}", rigid, off, loss))
     apart = [
         abs(a["rebound"] - b["rebound"])
         for a, b in zip(hits[::2], hits[1::2], strict=True)
         if not (a["failure"] or b["failure"])
     ]
     fails = [r for r in hits if r["failure"]]
-    slowest = min(fails, key=lambda r: r["speed"])
-    found.lines.append(
+    slowest = min(fails, key=lambda r: r["speed"], default=None)
+    failing = (
+        "none fails"
+        if slowest is None
+        else f"fails from {slowest['speed']:g} c_p on at Courant {slowest['courant']:g}"
+    )
+    found.append(
         Line(
-            "Contact: impact",
+            f"Contact: impact{on}",
             "",
-            f"rebounds at Courant 0.14 and 0.35 differ by at most {max(apart):.2f}; fails from "
-            f"{slowest['speed']:g} c_p on at Courant {slowest['courant']:g}",
+            f"rebounds at Courant 0.14 and 0.35 differ by at most {max(apart):.2f}; {failing}",
             "SimulationError: inverted, or left the grid.",
         )
     )

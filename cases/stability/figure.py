@@ -201,17 +201,18 @@ def incline(axes: Axes, tables: Tables) -> None:
     axes.plot(ratio, np.maximum(0.0, 1.0 - ratio), **LIMIT)
     axes.plot(ratio, np.where(ratio < 1 / 3, 1.0 - ratio, 2 / 3), **LIMIT)
     marks = {32: "o", 64: "s", 128: "^"}
-    for (shape, cells), rows in groups(tables["incline"], "shape", "cells").items():
+    for (law, shape, cells), rows in groups(tables["incline"], "law", "shape", "cells").items():
+        colours = ("C0", "C1") if law == "wall" else ("C2", "C3")
         axes.plot(
             column(rows, "ratio"), column(rows, "measured"), marks[cells], ms=4, mfc="none",
-            color="C0" if shape == "block" else "C1", label=f"{shape}, {cells} cells",
+            color=colours[shape != "block"], label=f"{shape}, {cells} cells, {law}",
         )  # fmt: skip
     note(axes, 2.2, 0.56, "disc, rigid", color="0.35")
     note(axes, 2.2, 0.06, "block, rigid", color="0.35")
     axes.set_xlabel("friction / tan(slope)")
     axes.set_ylabel("acceleration / (g sin)")
     axes.set_title("Incline: stick, slide, roll")
-    axes.legend(fontsize=6, loc="center right", bbox_to_anchor=(1.0, 0.38))
+    axes.legend(fontsize=5, ncols=2, loc="center right", bbox_to_anchor=(1.0, 0.36))
 
 
 def adversary(axes: Axes, tables: Tables) -> None:

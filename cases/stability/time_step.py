@@ -143,6 +143,29 @@ def resting_limit(body: str, steps: int, shift: float = 0.0) -> dict[str, Any]:
     return {"body": name, "theory": theory, "measured": measured}
 
 
+def viscous_limit(body: str, share: float, steps: int) -> dict[str, Any]:
+    """Limit of a viscous body at rest, as the scene's check has it, beside what a kick shows.
+
+    Parameters
+    ----------
+    body : {"isolated particle", "free block"}
+    share : float
+        k eta / (rho dx^2), with the limit k without viscosity: `Material.largest_time_step`.
+    steps : int
+    """
+    scene = block_scene(steps=steps)
+    material, elastic = scene.material, scene.largest_time_step
+    eta = share * material.density * scene.grid.dx**2 / elastic
+    scene = replace(scene, material=replace(material, viscosity=eta))
+    particles = isolated(scene) if body == "isolated particle" else discretise(scene)
+    mass = np.ones(len(particles.position))
+    theory = scene.largest_time_step * material.wave_speed / scene.grid.dx
+    measured = largest(
+        lambda c: stays_small(scene, particles, mass, c), 0.8 * theory, 3.0 * theory, 0.005
+    )
+    return {"body": body, "share": share, "theory": theory, "measured": measured}
+
+
 MOTIONS = {
     "spin": (0.0, -1.0, 1.0, 0.0),
     "squeeze": (-1.0, 0.0, 0.0, -1.0),
@@ -175,7 +198,7 @@ def moving_limit(motion: str, rate: float, spacing: float) -> dict[str, Any]:
 
 
 def points(quick: bool) -> Points:
-    """Bodies at rest, and motions by their rate."""
+    """Bodies at rest, elastic and viscous, and motions by their rate."""
     steps = 1000 if quick else 4000
     shifts = (0.0, 0.25, 0.5) if quick else (0.0, 0.125, 0.25, 0.375, 0.5)
     rest: Rows = [
@@ -183,17 +206,22 @@ def points(quick: bool) -> Points:
         *({"body": "free block", "steps": steps, "shift": shift} for shift in shifts),
         {"body": "bulk", "steps": steps},
     ]
+    viscous = [
+        {"body": body, "share": share, "steps": steps}
+        for body in ("isolated particle", "free block")
+        for share in ((1.0,) if quick else (0.1, 0.3, 1.0, 3.0))
+    ]
     motion = [
         {"motion": name, "rate": rate, "spacing": 0.02 if quick else 0.01}
         for name in MOTIONS
         for rate in (RATES[::3] if quick else RATES)
     ]
-    return {resting_limit: rest, moving_limit: motion}
+    return {resting_limit: rest, viscous_limit: viscous, moving_limit: motion}
 
 
 def measure(measured: Measured) -> Found:
     """Limits at rest and in motion, and what a scene says to a step that is too long."""
-    rest, motion = measured[resting_limit], measured[moving_limit]
+    rest, viscous, motion = (measured[f] for f in (resting_limit, viscous_limit, moving_limit))
     scene = block_scene()
     legal, said = scene.largest_time_step, ""
     try:
@@ -208,6 +236,20 @@ def measure(measured: Measured) -> Found:
     for body, rows in by_body.items():
         theory, found = (min(row[key] for row in rows) for key in ("theory", "measured"))
         lines.append(Line(f"Time step too long: {body}", f"{theory:.3f}", f"{found:.3f}", refused))
+    for body in dict.fromkeys(row["body"] for row in viscous):
+        rows = [row for row in viscous if row["body"] == body]
+        said_of, found_of = (
+            ", ".join(f"{row[key]:.3f} at {row['share']:g}" for row in rows)
+            for key in ("theory", "measured")
+        )
+        lines.append(
+            Line(
+                f"Time step too long: {body} with viscosity",
+                f"{said_of} (k eta / (rho dx^2))" if body == "isolated particle" else "",
+                found_of,
+                "Refused from the isolated particle's on: SceneError.",
+            )
+        )
     worst = {
         rate: min(r["measured"] for r in motion if r["rate"] == rate)
         for rate in dict.fromkeys(r["rate"] for r in motion)
@@ -221,4 +263,7 @@ def measure(measured: Measured) -> Found:
             "The particle inverts: SimulationError.",
         )
     )
-    return Found({"time_step_rest": rest, "time_step_motion": motion}, lines)
+    tables = {
+        "time_step_rest": rest, "time_step_viscous": viscous, "time_step_motion": motion,
+    }  # fmt: skip
+    return Found(tables, lines)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpmopt.assess import robustness, threshold
+from mpmopt.assess.forces import books
 from mpmopt.assess.refinement import study
 from mpmopt.assess.threshold import (
     best_actuated,
@@ -18,6 +19,7 @@ from mpmopt.assess.threshold import (
     solid_reference,
     unactuated,
 )
+from mpmopt.assess.trajectory import post_processed as without_grey
 from mpmopt.design.problem import Variables
 from mpmopt.errors import SimulationError
 from mpmopt.optimisation.history import Optimisation
@@ -35,7 +37,8 @@ def summarise(
 
     The baseline is that of `baseline_particles`, or empty.
 
-    Reference designs count with the better of the first and the best design's actuation.
+    Reference designs count with the better of the first and the best design's actuation. The cost
+    of transport is that of the post-processed design, over all of its travel.
     """
     instance("summarise", "result", result, Optimisation)
     best, problem = result.result, result.problem()
@@ -64,6 +67,11 @@ def summarise(
         "optimised": best.objective,
         "post_processed": _value_or_none(lambda: post_processed(problem, best.x)),
         "actuation_off": _value_or_none(lambda: unactuated(problem, best.x)),
+        "cost_of_transport": None
+        if not any(problem.scene.gravity)
+        else _value_or_none(
+            lambda: books(without_grey(problem, best.x).simulation).cost_of_transport
+        ),
         "disconnected_particles": int(
             (pieces(problem.scene, threshold.kept(problem, best.x)) > 0).sum()
         ),

@@ -15,8 +15,9 @@ from scipy import sparse
 
 from mpmopt import kernels
 from mpmopt.assess.trajectory import with_image
-from mpmopt.errors import DesignError
+from mpmopt.kernels.lagrangian import LEAST_J
 from mpmopt.scene import Scene
+from mpmopt.simulation.lagrangian import LagrangianSimulation
 from mpmopt.simulation.simulation import Simulation
 
 # What a state has, and what it is given (less than zero: what is taken from it).
@@ -38,7 +39,8 @@ class Books:
         layers store.
     work : dict of str to (S + 1,) array
         What was done so far, by whom: actuation, viscosity, friction and damping of grounds, walls
-        in all, and transfer between particles and nodes, of which no body knows.
+        in all, and transfer between particles and nodes, of which no body knows; the formulation
+        "total" has neither of the last two.
     supports : tuple of str
         The scene's grounds in their order, and its walls as one.
     force : (S, P, 2) array
@@ -93,11 +95,49 @@ class Books:
         """
         steps = len(self.force)
         starts = np.arange(min(count, steps)) * steps // min(count, steps)
+        middle = self.time[starts] + 0.5 * self.scene.time_step * np.diff(starts, append=steps)
+        return middle, *self._over(starts)
+
+    def around(self, frames: NDArray[np.integer]) -> tuple[Array, Array]:
+        """Forces and places (F, P, 2) at F instants, means from halfway to the ones beside them.
+
+        Parameters
+        ----------
+        frames : (F,) array of int
+            Increasing numbers of steps.
+        """
+        starts = np.concatenate([[0], (frames[:-1] + frames[1:] + 1) // 2])
+        # Instants that are the same step, as there are where steps are few, have its force.
+        return self._over(np.minimum(starts, len(self.force) - 1))
+
+    def rows(self, count: int = 200) -> list[dict[str, float]]:
+        """A table of as many parts of the time as `means` has.
+
+        Each has its middle; the energies, and the works done so far, at its end; and every
+        support's mean force on the body and its place.
+        """
+        time, force, place = self.means(count)
+        steps = len(self.force)
+        ends = (np.arange(len(time)) + 1) * steps // len(time)
+        rows = []
+        for n, end in enumerate(ends):
+            row = {"time": float(time[n])}
+            row |= {f"energy, {name}": float(each[end]) for name, each in self.energy.items()}
+            row |= {f"work of {name}": float(each[end]) for name, each in self.work.items()}
+            for k, support in enumerate(self.supports):
+                for what, values in (("force", force), ("place", place)):
+                    for axis, value in zip("xy", values[n, k]):
+                        row[f"{what} of {support}, {axis}"] = float(value)
+            rows.append(row)
+        return rows
+
+    def _over(self, starts: NDArray[np.integer]) -> tuple[Array, Array]:
+        """Mean forces and places of the steps from each start to the next, one at least."""
 
         def summed(values: Array) -> Array:
             return np.add.reduceat(values, starts)
 
-        lengths = np.diff(starts, append=steps)
+        lengths = np.maximum(np.diff(starts, append=len(self.force)), 1)
         there = np.isfinite(self.place)
         often = summed(there.astype(float))
         place = np.divide(
@@ -106,8 +146,7 @@ class Books:
             out=np.full(often.shape, np.nan),
             where=often > 0.0,
         )
-        middle = self.time[starts] + 0.5 * self.scene.time_step * lengths
-        return middle, summed(self.force) / lengths[:, None, None], place
+        return summed(self.force) / lengths[:, None, None], place
 
 
 def books(simulation: Simulation, progress: Callable[[], None] | None = None) -> Books:
@@ -121,22 +160,20 @@ def books(simulation: Simulation, progress: Callable[[], None] | None = None) ->
 
     Raises
     ------
-    DesignError
-        If the scene's formulation is not the one whose steps these are.
     SimulationError
         As `Simulation.run` does.
     """
-    if simulation.scene.formulation != "updated":
-        raise DesignError(
-            f'books: the formulation "{simulation.scene.formulation}" has no transfer to keep '
-            'books of; take the scene in "updated"'
-        )
-    steps, scene, account = simulation.steps, simulation.scene, _Account(simulation)
+    account = (
+        _LatticeAccount(simulation)
+        if isinstance(simulation, LagrangianSimulation)
+        else _Account(simulation)
+    )
+    steps, scene = simulation.steps, simulation.scene
     supports = tuple(f"ground {k}" for k in range(len(scene.layers)))
     supports += ("walls",) * bool(scene.walls)
     energies, works = np.empty((steps + 1, len(ENERGIES))), np.zeros((steps + 1, len(WORKS)))
     force, place = np.empty((2, steps, len(supports), 2))
-    states = _states(simulation)
+    states = account.states()
     first = old = next(states)
     held, given = account.held(old), 0.0
     energies[0] = account.energies(old)
@@ -150,7 +187,7 @@ def books(simulation: Simulation, progress: Callable[[], None] | None = None) ->
         old = new
         if progress is not None:
             progress()
-    moved = account.mass @ (old[:2] - first[:2]).T / account.mass.sum()
+    moved = account.centre(old) - account.centre(first)
     return Books(
         scene=scene,
         time=scene.time_step * np.arange(steps + 1.0),
@@ -165,18 +202,12 @@ def books(simulation: Simulation, progress: Callable[[], None] | None = None) ->
     )
 
 
-def _states(simulation: Simulation) -> Iterator[Array]:
-    """States (12, N) after 0, 1, ... steps; of a scene with a mirror (12, 2 N)."""
-    mirror = simulation.scene.mirror
-    for state in simulation.states():
-        yield state.real if mirror is None else with_image(state.real, mirror)
-
-
 class _Account:
-    """What a step does with energy, of N particles and M nodes."""
+    """What a step does with energy, of N particles and M nodes; of a mirror both halves count."""
 
     def __init__(self, simulation: Simulation) -> None:
-        self.scene = scene = simulation.scene
+        self.simulation, self.scene = simulation, simulation.scene
+        scene = simulation.scene
         self.layers = scene.layers
         data, count = simulation.data, simulation.initial.shape[1]
         halves = 1 if scene.mirror is None else 2
@@ -190,7 +221,12 @@ class _Account:
         actuated = [of_particles(there) for there in data.actuated]
         self.actuated = np.reshape(actuated, (len(actuated), len(self.mass)))
         self.stress = np.array([actuator.stress for actuator in scene.actuators]).reshape(-1, 2, 2)
-        whole = simulation.parameters._replace(mirror_axis=-1)
+        self._prepare()
+
+    def _prepare(self) -> None:
+        """What nodes have, for which steps are to be looked at."""
+        scene = self.scene
+        whole = self.simulation.parameters._replace(mirror_axis=-1)
         self.parameters = whole._replace(walls=whole.walls[:0]), whole
         self.cells = scene.grid.cells[0] + 1, scene.grid.cells[1] + 1
         i, j = np.divmod(np.arange(self.cells[0] * self.cells[1]), self.cells[1])
@@ -199,6 +235,19 @@ class _Account:
         self.ground = np.argmin([d for d, _ in lines], axis=0) if lines else np.zeros(i.size, int)
         self.normal = np.array([n for _, n in lines] or np.zeros((1, *self.nodes.shape)))
         self.normal = self.normal[self.ground, :, np.arange(i.size)].T
+
+    def _both(self, state: NDArray) -> Array:
+        """A state (12, N) of particles, and of a scene with a mirror its image (12, 2 N)."""
+        mirror = self.scene.mirror
+        return state.real if mirror is None else with_image(state.real, mirror)
+
+    def states(self) -> Iterator[Array]:
+        """States (12, N) after 0, 1, ... steps."""
+        yield from map(self._both, self.simulation.states())
+
+    def centre(self, state: Array) -> Array:
+        """Of mass (2,)."""
+        return state[:2] @ self.mass / self.mass.sum()
 
     def _midway(self, state: Array) -> tuple[Array, Array]:
         """Where particles are and how deformed, (2, N) and (2, 2, N), when they have v and C."""
@@ -221,11 +270,19 @@ class _Account:
             normals.append(normal)
         return forces, np.array(normals).reshape(-1, *x.shape)
 
+    def kinetic(self, state: Array) -> float:
+        """Energy."""
+        _, v, C, _ = kernels.parts(state)
+        return self._motion(v, C)
+
+    def _logarithm(self, F: Array) -> Array:
+        """ln J of deformation gradients (2, 2, N)."""
+        return np.log(_determinant(F))
+
     def energies(self, state: Array) -> tuple[float, ...]:
         """`ENERGIES` of a state."""
-        _, v, C, _ = kernels.parts(state)
         x, F = self._midway(state)
-        log_J = np.log(F[0, 0] * F[1, 1] - F[0, 1] * F[1, 0])
+        log_J = self._logarithm(F)
         density = kernels.plain(kernels.energy_density)(F.reshape(4, -1), log_J, self.constants)
         borne, _ = self._bearing(x)
         share = 2.0 * self.stiffness * self.volume
@@ -234,7 +291,7 @@ class _Account:
             for b, layer in zip(borne, self.layers)
         )
         fallen = -float((self.mass * x).sum(axis=1) @ self.scene.gravity)
-        return self._motion(v, C), float((self.volume * density).sum()), fallen, layer
+        return self.kinetic(state), float((self.volume * density).sum()), fallen, layer
 
     def held(self, state: Array) -> Array:
         """What each actuator squeezes (K,): V/2 S : F^T F."""
@@ -251,7 +308,7 @@ class _Account:
         _, v_new, C_new, F = kernels.parts(new)
 
         # Stress: elastic, of actuators, viscous.
-        log_J = np.log(F[0, 0] * F[1, 1] - F[0, 1] * F[1, 0])
+        log_J = self._logarithm(F)
         xx, xy, yy = kernels.plain(kernels.kirchhoff)(F.reshape(4, -1), log_J, self.constants)
         sS = np.einsum("k,kp,kab->abp", signal, self.actuated, self.stress)
         FT = F.transpose(1, 0, 2)
@@ -338,6 +395,130 @@ class _Account:
         return np.reshape(forces, (-1, 2)), np.reshape(places, (-1, 2))
 
 
+class _LatticeAccount(_Account):
+    """The same of a total Lagrangian body, whose states are those of its nodes (M, 4).
+
+    A state's velocity is what led to its place: in the middle of the way both belong together, and
+    from there to the next middle a node goes dt times the mean of its old and new velocity. So the
+    work of all that changes a node's momentum is exact, and of it only strains have an error.
+    """
+
+    simulation: LagrangianSimulation
+
+    def _prepare(self) -> None:
+        lattice = self.simulation.lattice
+        # Nodes beside the mirror plane have their image's mass too, and stand for half a node each.
+        shares = np.ones((lattice.columns + 2, lattice.rows + 2))
+        if lattice.mirror_axis >= 0:
+            beside = shares[-2:] if lattice.mirror_axis == 0 else shares[:, -2:]
+            beside[:] = 0.5
+        m = lattice.mass.real.astype(float)
+        self._per_m = np.divide(1.0, m, out=np.zeros_like(m), where=m > 0.0)
+        self._m = m * shares.ravel()
+        if self.scene.mirror is not None:
+            self._m = np.tile(self._m, 2)
+
+    def states(self) -> Iterator[Array]:
+        for nodes in self.simulation.node_states():
+            yield nodes.real
+
+    def _nodes(self, nodes: Array) -> Array:
+        """State (4, M) of nodes and their images."""
+        mirror, both = self.scene.mirror, nodes.T
+        if mirror is not None:
+            image = nodes.T.copy()
+            image[mirror.normal] = 2.0 * mirror.position - image[mirror.normal]
+            image[2 + mirror.normal] *= -1.0
+            both = np.concatenate([both, image], axis=1)
+        return both
+
+    def centre(self, state: Array) -> Array:
+        return self._nodes(state)[:2] @ self._m / self._m.sum()
+
+    def _midway(self, state: Array) -> tuple[Array, Array]:
+        middle = state.copy()
+        middle[:, :2] -= 0.5 * self.scene.time_step * middle[:, 2:]
+        x, _, _, F = kernels.parts(self._both(self.simulation.particle_state(middle)))
+        return x, F
+
+    def kinetic(self, state: Array) -> float:
+        return 0.5 * float((self._m * self._nodes(state)[2:] ** 2).sum())
+
+    def _logarithm(self, F: Array) -> Array:
+        J = _determinant(F)
+        safe = np.maximum(J, LEAST_J)
+        off = (J - safe) / safe
+        return np.log(safe) + off - 0.5 * off**2
+
+    def step(
+        self, old: Array, new: Array, signal: Array, n: int
+    ) -> tuple[tuple[float, ...], Array, Array]:
+        simulation, dt = self.simulation, self.scene.time_step
+        half = self.simulation.particle_state(old)
+        x, _, _, F = kernels.parts(self._both(half))
+        velocity = old.copy()
+        velocity[:, :2] = velocity[:, 2:]
+        rate = kernels.parts(self._both(simulation.particle_state(velocity)))[3]
+
+        # Viscous stress, on the strain from the middle of one step to that of the next.
+        F_old, F_new = self._midway(old)[1], self._midway(new)[1]
+        eta = self.constants[kernels.PARAMETERS.index("viscosity")]
+        E = np.einsum("kip,kjp->ijp", F, rate)
+        viscous = eta * 0.5 * _product(F, E + E.transpose(1, 0, 2))
+        dissipated = float((self.volume * viscous * (F_new - F_old)).sum())
+
+        # Velocities of nodes without friction and damping.
+        borne, normal = self._bearing(x)
+        push = (borne[:, None] * normal).sum(axis=0)
+        count = half.shape[1]
+        stress = self._first_piola(F, viscous, signal)[:, :, :count]
+        N, Gx, Gy = simulation._weights
+        force = np.concatenate([
+            N.T @ push[:, :count].T - Gx.T @ stress[:, 0].T - Gy.T @ stress[:, 1].T,
+            (N.T @ borne[:, :count].sum(axis=0))[:, None],
+        ], axis=1)  # fmt: skip
+        self._fold(force)
+        free = old[:, 2:] + dt * (force[:, :2] * self._per_m[:, None] + self.scene.gravity)
+        held = (force[:, 2] > 0.0) & (self._per_m > 0.0)
+        taken = old.copy()
+        taken[:, 2:] = np.where(held[:, None], new[:, 2:] - free, 0.0)
+
+        places, lost, before, after = (self._nodes(each) for each in (old, taken, old, new))
+        lines = [layer.line.distance(places[:2]) for layer in self.layers]
+        self.ground = np.argmin([d for d, _ in lines], axis=0) if lines else places[0] * 0
+        along = np.zeros_like(places[:2])
+        for k, (_, each) in enumerate(lines):
+            along[:, self.ground == k] = each[:, self.ground == k]
+        impulse, midst = self._m * lost[2:], 0.5 * (before[2:] + after[2:])
+        resisting = (impulse * along).sum(axis=0) * along
+        damping = float((resisting * midst).sum())
+        friction = float((impulse * midst).sum()) - damping
+        forces = self._supports(x, borne, normal, impulse.T, np.zeros((0, 2)))
+        return (-dissipated, friction, damping, 0.0, 0.0), *forces
+
+    def _first_piola(self, F: Array, viscous: Array, signal: Array) -> Array:
+        """V P (2, 2, N): elastic, viscous, and of actuators."""
+        lam, mu = (self.constants[kernels.PARAMETERS.index(n)] for n in ("lame_lambda", "lame_mu"))
+        J = _determinant(F)
+        safe = np.maximum(J, LEAST_J)
+        slope = (1.0 - (J - safe) / safe) / safe
+        cofactor = np.array([[F[1, 1], -F[1, 0]], [-F[0, 1], F[0, 0]]])
+        elastic = mu * F + (lam * self._logarithm(F) - mu) * slope * cofactor
+        sS = np.einsum("k,kp,kab->abp", signal, self.actuated, self.stress)
+        return self.volume * (elastic + viscous + _product(F, sS))
+
+    def _fold(self, records: Array) -> None:
+        """Add to nodes beside the mirror plane what the mirrored half puts there."""
+        lattice = self.simulation.lattice
+        axis = lattice.mirror_axis
+        if axis >= 0:
+            lines = records.reshape(lattice.columns + 2, lattice.rows + 2, -1)
+            beside = lines[-2:] if axis == 0 else lines[:, -2:].swapaxes(0, 1)
+            signs = np.ones(records.shape[1])
+            signs[axis] = -1.0
+            beside[:] = beside + signs * beside[::-1]
+
+
 def _mean(places: Array, weights: Array) -> Array:
     """Mean of places (2, N), not a number if weights (N,) are zero."""
     total = weights.sum()
@@ -352,4 +533,9 @@ def _product(a: Array, b: Array) -> Array:
 def _inverse(F: Array) -> Array:
     """Inverses of tensors (2, 2, N)."""
     adjugate = np.array([[F[1, 1], -F[0, 1]], [-F[1, 0], F[0, 0]]])
-    return adjugate / (F[0, 0] * F[1, 1] - F[0, 1] * F[1, 0])
+    return adjugate / _determinant(F)
+
+
+def _determinant(F: Array) -> Array:
+    """Of tensors (2, 2, N)."""
+    return F[0, 0] * F[1, 1] - F[0, 1] * F[1, 0]

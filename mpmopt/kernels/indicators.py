@@ -2,9 +2,10 @@
 
 import math
 
-from mpmopt.kernels.arrays import AFFINE, DEFORMATION, components
+from mpmopt.kernels.arrays import AFFINE, DEFORMATION, POSITION, at, components
 from mpmopt.kernels.compiler import jit
 from mpmopt.kernels.deformation import stretches
+from mpmopt.kernels.layer import rise
 from mpmopt.kernels.material import constants_of_one, wave_modulus
 from mpmopt.kernels.viscosity import viscous_modulus
 
@@ -18,7 +19,8 @@ def indicators(state, data, parameters, first, last):
     The largest Courant number and dt |C|, the smallest J, and the largest stretch of
     particles with `SOLID` of the solid's stiffness or more; with its
     `wave_modulus` M and `viscous_modulus` N, an isolated particle is unstable where the Courant
-    number k_v + sqrt(k_v^2 + k_e^2) is above 1, k_e^2 = (dt/dx)^2 M/rho and k_v = dt/dx^2 N/rho.
+    number k_v + sqrt(k_v^2 + k_e^2) is above 1, k_e^2 = (dt/dx)^2 M/rho and k_v = dt/dx^2 N/rho;
+    within layers of ground whose forces rise with r, k_e^2 has dt^2 r / (4 rho) more.
     Extremes do not depend on the order in which they are taken.
     """
     courant = fastest = longest = 0.0
@@ -33,6 +35,10 @@ def indicators(state, data, parameters, first, last):
                 trace, apart = stretches(F)
                 constants, specific = constants_of_one(data, g, k), volume / mass
                 elastic = per_cell * per_cell * wave_modulus(trace, apart, constants) * specific
+                if len(parameters.ground.layers):
+                    x, y = state[at(g, POSITION), k].real, state[at(g, POSITION + 1), k].real
+                    share = data.stiffness[g, k].real * specific
+                    elastic += 0.25 * parameters.dt * parameters.dt * share * rise(x, y, parameters)
                 viscous = viscous_modulus(trace, apart, constants) * specific
                 viscous *= per_cell / parameters.dx
                 if data.stiffness[g, k].real >= SOLID:

@@ -40,6 +40,21 @@ def bearing_adjoint(d, thickness, capacity, b_bar):
 
 
 @jit
+def rise(x, y, parameters):
+    """How fast layers' forces on solid at a place rise with depth: the sum of kappa / thickness."""
+    ground, found = parameters.ground, 0.0
+    i, j = round(x * parameters.per_dx), round(y * parameters.per_dx)
+    known = 0 <= i < parameters.nodes_x and 0 <= j < parameters.nodes_y
+    if known and ground.clearance[i * parameters.nodes_y + j] > parameters.dx:
+        return found
+    for n in range(len(ground.layers)):
+        d, _, _, _ = distance(x, y, ground, n)
+        if d < ground.layers[n, THICKNESS]:
+            found += ground.layers[n, STIFFNESS] / ground.layers[n, THICKNESS]
+    return found
+
+
+@jit
 def stored(d, thickness, capacity):
     """Energy of which `bearing` is the force: capacity thickness/2 <1 - d/thickness>^2."""
     short = max(1.0 - d / thickness, 0.0)

@@ -46,7 +46,9 @@ def closest(
         if not solid[g, k]:
             continue
         x, y = float(state[at(g, POSITION), k].real), float(state[at(g, POSITION + 1), k].real)
-        i, j = int(x * parameters.per_dx), int(y * parameters.per_dx)
+        # What has left the grid, as a total Lagrangian body may, is in the cells along its edge.
+        i = int(min(max(x * parameters.per_dx, 0.0), columns - 1.0))
+        j = int(min(max(y * parameters.per_dx, 0.0), rows - 1.0))
         # Those that are met later look back at this one, so that each pair is looked at once.
         for a in range(max(i - 1, 0), min(i + 2, columns)):
             for b in range(max(j - 1, 0), min(j + 2, rows)):

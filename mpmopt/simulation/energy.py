@@ -42,6 +42,9 @@ class Balance:
         self._seen, self._held = -1, np.zeros(signal.shape[1])
         self._last: tuple[float, float] | None = None
         self._lowest, self._rise, self._turnover = math.inf, 0.0, 0.0
+        # Steps so far in which a clamp moved: it does work, which nobody counts.
+        moving = parameters.clamps[..., 4:].any(axis=(1, 2))
+        self._moved, self._looked = np.concatenate([[0], np.add.accumulate(moving)]), 0
         # What is rounding only: of strains, and of positions in gravity.
         constants = data.stiffness.real * data.constants
         modulus = float((data.volume.real * plain(wave_modulus)(2.0, 0.0, constants)).sum())
@@ -82,17 +85,19 @@ class Balance:
         else:
             self._turnover += abs(potential - self._last[0]) + abs(work - self._last[1])
         self._last = potential, work
-        self._lowest = min(self._lowest, balance)
-        self._rise = max(self._rise, balance - self._lowest)
+        if math.isinf(kinetic) or self._moved[step] == self._moved[self._looked]:
+            self._lowest = min(self._lowest, balance)
+            self._rise = max(self._rise, balance - self._lowest)
+        else:
+            self._lowest = balance
+        self._looked = step
 
     @property
     def appeared(self) -> float:
         """Greatest rise, as a share of what kinetic and potential energy and work turned over.
 
-        Clamps that move do work, which nobody counts: then it is zero.
+        From one look to the next in which a clamp moves, a rise does not count.
         """
-        if self._parameters.clamps[..., 4:].any():
-            return 0.0
         if math.isinf(self._rise):
             return math.inf
         return self._rise / max(self._turnover, self._rounding)

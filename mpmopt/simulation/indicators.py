@@ -30,7 +30,8 @@ class Indicators(NamedTuple):
     ----------
     courant : float
         Largest (dt / dx) sqrt(M / rho) with the stiffness M of the stretched particle, more where
-        it is viscous (docs: theory, "Step control"). An isolated particle is unstable above 1.
+        it is viscous or in a layer of ground (docs: theory, "Step control"). An isolated particle
+        is unstable above 1.
     velocity_increment : float
         Largest dt |C|, the Frobenius norm. Below 1 no particle can be inverted by a step.
     jacobian : float

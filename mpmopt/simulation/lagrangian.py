@@ -33,6 +33,10 @@ class LagrangianSimulation(Simulation):
         super().__init__(*args, **kwargs)
         if len(args) > 5 or kwargs.get("state") is not None:
             raise DesignError("the total Lagrangian formulation begins at rest; give no state")
+        if self.initial.real.dtype == np.float32:
+            raise DesignError(
+                'the total Lagrangian formulation has no precision "single"; take "double"'
+            )
         scene, particles = self.scene, self.particles
         per_cell, dx = scene.particles_per_cell, scene.grid.dx
         count, dtype = len(particles.position), self.initial.dtype
@@ -252,13 +256,17 @@ class LagrangianSimulation(Simulation):
 
     def states(self) -> Iterator[NDArray]:
         """As `Simulation.states`."""
+        yield from map(self.particle_state, self.node_states())
+
+    def node_states(self) -> Iterator[NDArray]:
+        """The states (M, 4) of the nodes after 0, 1, ... steps, one after the other."""
         states = np.zeros((2, *self.start.shape), self.start.dtype)
         states[0] = self.start
-        yield self.particle_state(self.start)
+        yield self.start
         for step in range(self.steps):
             self._advance(states, step, step + 1, step)
             states[0] = states[1]
-            yield self.particle_state(states[0])
+            yield states[0].copy()
 
     def watch(self, instants: Collection[int] = ()) -> Watched:
         """As `Simulation.watch`."""

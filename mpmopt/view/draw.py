@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from io import BytesIO
 from typing import Any
 
@@ -15,11 +16,12 @@ from matplotlib.backend_bases import RendererBase
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import Collection
 from matplotlib.figure import Figure
-from matplotlib.patches import Polygon, Rectangle
+from matplotlib.patches import FancyArrowPatch, Polygon, Rectangle
 from matplotlib.path import Path as Outline
 from matplotlib.transforms import Affine2D
 from numpy.typing import ArrayLike, NDArray
 
+from mpmopt.assess.forces import Books
 from mpmopt.assess.trajectory import Motion, optimised
 from mpmopt.design.problem import Problem
 from mpmopt.optimisation.history import Optimisation
@@ -30,6 +32,8 @@ RED, BLUE = (0.85, 0.1, 0.1), (0.1, 0.25, 0.85)
 OVERLAP = 1.15
 # Particles with less material than this are not drawn.
 FAINTEST = 0.02
+# The longest arrow, over the longer side of the picture.
+LONGEST = 0.15
 # What is rigid.
 SOLID: dict[str, Any] = {"facecolor": "0.88", "edgecolor": "0.6", "hatch": "//", "lw": 0.8}
 
@@ -175,6 +179,76 @@ class Squares(Collection):
         self.set_transform(Affine2D(scale))
         self.set_offset_transform(self.axes.transData)
         super().draw(renderer)
+
+
+class Arrows:
+    """Forces of supports on a body, as arrows that end where each acts.
+
+    Parameters
+    ----------
+    axes : matplotlib Axes
+    force, place : (F, P, 2) arrays
+        Of P supports at F instants; a place that is not a number has no arrow.
+    scale : float
+        Length of an arrow over its force.
+    frame : int, optional
+        Index of the instant that is shown at first.
+    """
+
+    def __init__(
+        self,
+        axes: Axes,
+        force: NDArray[np.float64],
+        place: NDArray[np.float64],
+        scale: float,
+        frame: int = 0,
+    ) -> None:
+        self._tip, self._tail = place, place - scale * force
+        style: dict[str, Any] = {"arrowstyle": "-|>", "mutation_scale": 9, "lw": 1.4}
+        style |= {"shrinkA": 0.0, "shrinkB": 0.0, "zorder": 5, "color": "black"}
+        self.patches = [FancyArrowPatch((0.0, 0.0), (1.0, 1.0), **style) for _ in force[0]]
+        for patch in self.patches:
+            axes.add_patch(patch)
+        self.show(frame)
+
+    def show(self, frame: int) -> None:
+        """Show another instant, given by its index."""
+        for patch, tail, tip in zip(self.patches, self._tail[frame], self._tip[frame]):
+            there = bool(np.isfinite(tip).all() and (tail != tip).any())
+            patch.set_visible(there)
+            if there:
+                patch.set_positions(tuple(tail), tuple(tip))
+
+
+@dataclass(frozen=True)
+class Forces:
+    """Forces and places (F, P, 2) of each of several motions, drawn to one scale.
+
+    Attributes
+    ----------
+    values : list of ((F, P, 2) array, (F, P, 2) array)
+    largest : float
+    scale : float
+        Length of an arrow over its force.
+    box : (2, 2) array
+        Lower and upper corner of a picture that holds all arrows and the motions.
+    """
+
+    values: list[tuple[NDArray[np.float64], NDArray[np.float64]]]
+    largest: float
+    scale: float
+    box: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, motions: Sequence[Motion], books: Sequence[Books]) -> Forces:
+        """The means around the motions' instants."""
+        values = [each.around(motion.frames) for motion, each in zip(motions, books, strict=True)]
+        sizes = [np.hypot(*np.moveaxis(force, -1, 0)).max(initial=0.0) for force, _ in values]
+        largest, box = float(max(sizes)), view(motions)
+        scale = LONGEST * float(np.ptp(box, axis=0).max()) / largest if largest else 0.0
+        tails = [(place - scale * force).reshape(-1, 2) for force, place in values]
+        corners = np.concatenate([box, *tails])  # some of which are not a number
+        return cls(values, largest, scale, np.array([np.nanmin(corners, 0), np.nanmax(corners, 0)]))
 
 
 def view(motions: Sequence[Motion]) -> NDArray[np.float64]:

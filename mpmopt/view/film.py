@@ -17,6 +17,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from numpy.typing import NDArray
 from PIL import Image
 
+from mpmopt.assess.forces import Books, books
 from mpmopt.assess.trajectory import Motion, equal_steps, optimised, post_processed, reference
 from mpmopt.errors import DesignError, MissingLibraryError, SimulationError, StorageError
 from mpmopt.io.files import replace_file
@@ -26,6 +27,8 @@ from mpmopt.scene import Scene
 from mpmopt.view.draw import (
     BLUE,
     RED,
+    Arrows,
+    Forces,
     Squares,
     draw_walls,
     format_of,
@@ -66,6 +69,8 @@ class Screen:
         Of one scene at the same instants.
     slow : float
         How many times slower they are shown, which the picture says.
+    books : sequence of Books, optional
+        Of the motions' bodies: arrows show what their supports push them with.
 
     Attributes
     ----------
@@ -73,9 +78,11 @@ class Screen:
     """
 
     @own_style()
-    def __init__(self, motions: Sequence[Motion], slow: float) -> None:
+    def __init__(self, motions: Sequence[Motion], slow: float, books: Sequence[Books] = ()) -> None:
         self._motions, self._slow = motions, slow
-        box = view(motions)
+        forces = Forces.of(motions, books) if books else None
+        box = view(motions) if forces is None else forces.box
+        self._longest = "" if forces is None else f"     longest arrow {forces.largest:.3g}"
         shape = float(np.divide(*(box[1] - box[0])[::-1]))
         columns, wide = (1, ABOVE) if shape < 0.75 else (len(motions), BESIDE)
         rows = len(motions) // columns
@@ -89,6 +96,7 @@ class Screen:
         figure.set_dpi(DPI)
         self.panels = []
         self._squares, self._labels = [], []
+        self._arrows: list[Arrows] = []
         for number, motion in enumerate(motions):
             row, column = divmod(number, columns)
             left, top = column * wide + 6, head + row * tall + label
@@ -103,6 +111,11 @@ class Screen:
             squares = Squares(motion)
             squares.set_animated(True)
             axes.add_collection(squares, autolim=False)
+            if forces is not None:
+                arrows = Arrows(axes, *forces.values[number], forces.scale)
+                for patch in arrows.patches:
+                    patch.set_animated(True)
+                self._arrows.append(arrows)
             self.panels.append(axes)
             self._squares.append(squares)
             self._labels.append(
@@ -131,6 +144,7 @@ class Screen:
         times = first.frames * first.scene.time_step
         self._clock.set_text(
             f"t = {times[number]:{format_of(times)}}     {self._slow:.3g} times slower"
+            f"{self._longest}"
         )
         form = format_of([motion.objective for motion in self._motions])
         self._canvas.restore_region(self._empty)
@@ -142,6 +156,10 @@ class Screen:
             label.set_text(f"{motion.name}: L = {motion.objective[number]:{form}}")
             axes.draw_artist(squares)
             axes.draw_artist(label)
+        for axes, arrows in zip(self.panels, self._arrows):
+            arrows.show(number)
+            for patch in arrows.patches:
+                axes.draw_artist(patch)
         return np.array(self._canvas.buffer_rgba())[..., :3]
 
 
@@ -175,7 +193,9 @@ class Filmed:
         )
 
 
-def film(path: Path, run: Optimisation, seconds: float | None = None) -> Filmed:
+def film(
+    path: Path, run: Optimisation, seconds: float | None = None, forces: bool = False
+) -> Filmed:
     """Write a film of a run's best design, the same without grey, and the solid reference design.
 
     All have the best design's actuation. A body that cannot be simulated is left out, but for the
@@ -188,6 +208,8 @@ def film(path: Path, run: Optimisation, seconds: float | None = None) -> Filmed:
     run : Optimisation
     seconds : float, optional
         That the film plays; default: as long as it takes to see each period of the actuation.
+    forces : bool, optional
+        Draw what ground and walls push the bodies with, which takes a few seconds more.
 
     Raises
     ------
@@ -214,14 +236,17 @@ def film(path: Path, run: Optimisation, seconds: float | None = None) -> Filmed:
     if count < 2:
         raise DesignError(f"film: seconds = {seconds!r} must be from {2 / RATE:g} to 600")
     instants = equal_steps(scene, count)
-    motions = [Motion.of(optimised(problem, x), instants)]
-    for body in (post_processed, reference):
+    bodies = [optimised(problem, x)]
+    motions = [Motion.of(bodies[0], instants)]
+    for make in (post_processed, reference):
         try:
-            motions.append(Motion.of(body(problem, x), instants))
+            body = make(problem, x)
+            motions.append(Motion.of(body, instants))
+            bodies.append(body)
         except SimulationError as error:
             logger.warning("the film is without a body: %s", error)
     slow = seconds / scene.duration
-    screen = Screen(motions, slow)
+    screen = Screen(motions, slow, [books(body.simulation) for body in bodies] if forces else ())
     with Progress("frames", screen.frames) as progress:
 
         def frames() -> Iterator[NDArray[np.uint8]]:

@@ -18,6 +18,8 @@ from mpmopt.io.files import replace_file
 from mpmopt.optimisation.history import Optimisation
 from mpmopt.scene import Scene
 from mpmopt.view.draw import (
+    Arrows,
+    Forces,
     Squares,
     draw_design,
     draw_history,
@@ -36,7 +38,9 @@ logger = logging.getLogger(__name__)
 
 
 @own_style()
-def plot_motion(path: str | os.PathLike[str], body: Body, pictures: int = 8) -> None:
+def plot_motion(
+    path: str | os.PathLike[str], body: Body, pictures: int = 8, books: Books | None = None
+) -> None:
     """Write a PNG of a body at equal intervals from start to end.
 
     Parameters
@@ -44,6 +48,8 @@ def plot_motion(path: str | os.PathLike[str], body: Body, pictures: int = 8) -> 
     path : Path
     body : Body
     pictures : int, optional
+    books : Books, optional
+        Of the body: arrows show what its supports push it with.
 
     Raises
     ------
@@ -53,14 +59,16 @@ def plot_motion(path: str | os.PathLike[str], body: Body, pictures: int = 8) -> 
         If the file cannot be written.
     """
     motion = Motion.of(body, equal_steps(body.simulation.scene, pictures))
-    box = view([motion])
+    forces = None if books is None else Forces.of([motion], [books])
+    box = view([motion]) if forces is None else forces.box
     width, height = box[1] - box[0]
     columns, wide = (2, 5.0) if height < 1.25 * width else (4, 2.5)  # inches of a panel
     columns = min(columns, pictures)
     rows = -(-pictures // columns)
     figure = new_figure(wide * columns, (wide * height / width + 0.35) * rows + 0.4)
     name = body.name[0].upper() + body.name[1:]
-    figure.suptitle(f"{name}, L = {motion.objective[-1]:{format_of(motion.objective)}}")
+    longest = "" if forces is None else f", longest arrow {forces.largest:.3g}"
+    figure.suptitle(f"{name}, L = {motion.objective[-1]:{format_of(motion.objective)}}{longest}")
     panels = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).ravel()
     for axes in panels[pictures:]:
         axes.set_axis_off()
@@ -69,6 +77,8 @@ def plot_motion(path: str | os.PathLike[str], body: Body, pictures: int = 8) -> 
         set_view(axes, box)
         draw_walls(axes, motion.scene, moving=True)
         axes.add_collection(Squares(motion, number), autolim=False)
+        if forces is not None:
+            Arrows(axes, *forces.values[0], forces.scale, number)
         axes.set_title(f"t = {time:{format_of(times)}}", fontsize=9)
         axes.tick_params(labelsize=7)
     replace_file(path, png(figure))
