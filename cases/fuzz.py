@@ -141,7 +141,6 @@ def plausible(draw: Any) -> dict[str, Any]:
         "direction": [1.0, 0.0] if mirrored or draw(st.booleans()) else [0.6, -0.8],
         "particles_per_cell": per_cell,
         "filter_length": draw(st.sampled_from([0.0, dx])),
-        "blend_time": draw(st.sampled_from([0.0, 0.0, 2.0, 1e9])) * time_step,
         "mirror": {"axis": "y", "position": 3 * dx} if mirrored else None,
     }
 

@@ -47,7 +47,6 @@ class Choice:
     thickness: float = C
     damping: float | None = None
     viscosity: float = 0.02
-    blend_time: float = 0.0
     per_cell: int = 2
     steps: int = 1  # as many as usual, times this
     actuated: bool = True
@@ -62,7 +61,6 @@ class Choice:
         return replace(
             scene,
             steps=round(seconds / dt),
-            blend_time=self.blend_time,
             material=replace(scene.material, viscosity=self.viscosity),
             walls=() if self.layer else (Wall("y", 4 * C, friction=0.5),),
             ground=(floor,) if self.layer else (),
@@ -72,7 +70,6 @@ class Choice:
 CHOICES = (
     Choice("layer"),
     Choice("clamped nodes", layer=False),
-    Choice("layer, blend time 2e-3", blend_time=2e-3),
     Choice("layer, damping 4", damping=4.0),
     Choice("layer, twice as thick", thickness=2 * C),
     Choice("layer, viscosity 0.05", viscosity=0.05, steps=2),

@@ -65,7 +65,7 @@ def test_the_energy_is_that_of_the_kernels(rng):
 @pytest.mark.parametrize(
     "changes",
     [
-        {"gap": 2 * C, "blend_time": 2e-2},
+        {"gap": 2 * C},
         {"gap": C, "material": Material(100.0, 100.0, viscosity=0.05)},
         {"velocity": (2.0, 0.0), "walls": (Wall("y", 4 * C, friction=0.3),)},
         {"gap": 1.5 * C, "ground": ground(friction=0.0, damping=0.0)},

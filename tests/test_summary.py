@@ -15,6 +15,7 @@ from mpmopt.assess.refinement import Variant
 from mpmopt.design.objective import Objective
 from mpmopt.design.problem import Problem
 from mpmopt.design.task import DEFAULT_TASK
+from mpmopt.design.variation import refined
 from mpmopt.errors import SimulationError
 from mpmopt.optimisation import presets
 from mpmopt.optimisation.history import Candidate, Optimisation
@@ -178,7 +179,7 @@ def test_the_least_of_a_refinement_study_is_of_half_the_step_and_half_the_cells(
 def test_a_design_on_finer_cells_takes_each_particle_from_the_nearest():
     phi = np.where(PROBLEM.particles.position[PROBLEM.particles.designed][:, 0] < 5 / 16, 1.0, -1.0)
     x = PROBLEM.join(phi, 0.5, 0.0, 0.0)
-    fine = Problem(refinement.finer(SCENE))
+    fine = Problem(refined(SCENE, 2))
     there = refinement.mapped(fine.scene, PROBLEM, x)
     keep = threshold.kept(PROBLEM, x)
     assert 0 < keep.sum() < keep.size

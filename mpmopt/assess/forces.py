@@ -190,7 +190,7 @@ class _Account:
         actuated = [of_particles(there) for there in data.actuated]
         self.actuated = np.reshape(actuated, (len(actuated), len(self.mass)))
         self.stress = np.array([actuator.stress for actuator in scene.actuators]).reshape(-1, 2, 2)
-        whole = simulation.parameters._replace(keep=0.0, mirror_axis=-1)
+        whole = simulation.parameters._replace(mirror_axis=-1)
         self.parameters = whole._replace(walls=whole.walls[:0]), whole
         self.cells = scene.grid.cells[0] + 1, scene.grid.cells[1] + 1
         i, j = np.divmod(np.arange(self.cells[0] * self.cells[1]), self.cells[1])
@@ -274,10 +274,9 @@ class _Account:
 
         # Velocities of nodes: as they were, after forces, after grounds, after walls.
         u_old = q * per_m[:, None]
-        grid = np.zeros((1, len(m), kernels.NODE_SIZE))
-        grid[0, :, :2], grid[0, :, 2], grid[0, :, 3] = q + added, m, N.T @ borne.sum(axis=0)
+        grid = np.column_stack([q + added, m, N.T @ borne.sum(axis=0)])
         u_free = (q + added) * per_m[:, None] + dt * there[:, None] * self.scene.gravity
-        window, after = (0, 0, *self.cells), np.zeros((2, 1, 2 * len(m)))
+        window, after = (0, 0, *self.cells), np.zeros((2, 2 * len(m)))
         clamps = self.parameters[1].clamps[n]
         for parameters, held_too, velocity in zip(self.parameters, (clamps[:0], clamps), after):
             kernels.update_nodes(grid, window, parameters, held_too, velocity)
@@ -285,7 +284,7 @@ class _Account:
         u_mean = 0.5 * (u_old + u)
 
         # Impulses of grounds and walls, whose work is that on the mean velocity.
-        held = grid[0, :, 3] > 0.0
+        held = grid[:, 3] > 0.0
         impulse = (held * m)[:, None] * (u_ground - u_free)
         resisting = (impulse * self.normal.T).sum(axis=1)[:, None] * self.normal.T
         stopping = m[:, None] * (u - u_free) - impulse

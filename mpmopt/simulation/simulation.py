@@ -280,11 +280,6 @@ class Simulation:
         return self.parameters._replace(clamps=self.parameters.clamps[first:last])
 
     @property
-    def fields(self) -> int:
-        """Sheets of nodes: two where particles keep a share of their own velocity, else one."""
-        return 2 if self.parameters.keep > 0.0 else 1
-
-    @property
     def steps(self) -> int:
         """Number of steps."""
         return self.scene.steps
@@ -325,7 +320,7 @@ class Simulation:
         groups, dtype = self.data.mass.shape[0], self.initial.dtype
         states, log = (kernels.STATE_SIZE * groups, 4), (groups, 4)
         nodes, _ = self.room
-        grid = (self.fields, nodes, kernels.NODE_SIZE)
+        grid = (nodes, kernels.NODE_SIZE)
         numbers = math.prod(states) + math.prod(log) + math.prod(grid)
         step_bytes = numbers * dtype.itemsize
         schedule = Schedule.choose(self.steps, step_bytes, wish)
