@@ -181,7 +181,7 @@ class LagrangianSimulation(Simulation):
         return kept[-1] if frames is None else np.array(kept)
 
     def _nodes_at(self, wanted: list[int]) -> Iterator[NDArray]:
-        """States (M, 4) of the nodes after so many steps each, to be used at once."""
+        """States (4, M) of the nodes after so many steps each, to be used at once."""
         states = np.zeros((2, *self.start.shape), self.start.dtype)
         states[0] = self.start
         step = 0
@@ -197,7 +197,7 @@ class LagrangianSimulation(Simulation):
         (nodes,) = self._nodes_at([step])
         other = self._from(step)
         other.start = nodes.copy()
-        other.start[:, 2:] += velocity
+        other.start[2:] += np.reshape(velocity, (2, 1))
         return other
 
     def states(self) -> Iterator[NDArray]:
