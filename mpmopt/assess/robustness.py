@@ -444,14 +444,18 @@ def _speeds(
     most = MOST_WORK_FULL if full else MOST_WORK
     with ThreadPoolExecutor(max(1, (os.cpu_count() or 1) // threads())) as pool:
         runs = {pool.submit(speed, robot, trial, most): name for name, trial in trials.items()}
-        for done in as_completed(runs):
-            name = runs[done]
-            try:
-                speeds[name] = done.result()
-            except SimulationError as error:
-                failures[name] = error.what
-            except SceneError as error:
-                failures[name] = str(error)
-            if progress is not None:
-                progress(name, math.nan if speeds[name] is None else float(speeds[name] or 0.0))
+        try:
+            for done in as_completed(runs):
+                name, value = runs[done], math.nan
+                try:
+                    value = speeds[name] = done.result()
+                except SimulationError as error:
+                    failures[name] = error.what
+                except SceneError as error:
+                    failures[name] = str(error)
+                if progress is not None:
+                    progress(name, value)
+        finally:
+            for run in runs:  # after an interrupt, those that have not begun
+                run.cancel()
     return speeds, failures
