@@ -20,6 +20,7 @@ import climber
 import crawler
 import numpy as np
 import walker
+from robots import worst
 
 from mpmopt.app.case import Case
 from mpmopt.app.multistart import multistart
@@ -53,12 +54,10 @@ def row(folder: Path) -> dict[str, Any]:
     def number(value: float | None) -> float:
         return float("nan") if value is None else float(value)
 
-    frictions = summary["speed_by_friction"].items()
-    within = [number(value) for name, value in frictions if 0.3 <= float(name) <= 0.8]
     return {
         "run": folder.name,
         "speed": number(summary["speed"]),
-        "worst at friction 0.3 to 0.8": float(np.min(within)),
+        "worst at friction 0.3 to 0.8": worst(summary),
         "kept at half the step": number(summary["kept"]["half_step"]),
         "on finer cells": number(summary["kept"]["finer_cells"]),
         "driven share": number(summary["driven_share"]),

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import robots
 import spread
 from conftest import SHORT, small_scene
 from PIL import Image
@@ -44,6 +45,23 @@ def test_the_worst_friction_counts_from_a_third_to_eight_tenths(tmp_path):
     torn = {**SUMMARY, "speed_by_friction": {"0.35": None, "0.5": 0.1}}
     (tmp_path / "summary.json").write_text(json.dumps(torn))
     assert np.isnan(spread.row(tmp_path)["worst at friction 0.3 to 0.8"])
+
+
+def test_a_table_of_robots_says_nothing_where_a_summary_does(tmp_path, capsys):
+    solid = {"post_processed": 0.4, "reference": 0.3, "failed_evaluations": 0}
+    study = {"followed": {"seconds": 7.5, "end": "falls"}}
+    for name, summary in (
+        ("full", {**SUMMARY, **solid, **study}),
+        ("walls", {**solid, "evaluations": 5, "seconds": 1.0}),
+    ):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "summary.json").write_text(json.dumps(summary))
+    table = tmp_path / "robots.csv"
+    assert robots.main([str(tmp_path / "full"), str(tmp_path / "walls"), "--out", str(table)]) == 0
+    full, walls = csv.DictReader(table.read_text().splitlines())
+    assert (full["mean speed"], full["kept at half the step"]) == ("0.100", "90%")
+    assert (full["goes on for"], full["a quarter as wide"]) == ("7.50, falls", "-")
+    assert (walls["mean speed"], walls["without grey, over the solid block"]) == ("-", "0.100")
 
 
 def test_a_spread_tells_median_worst_and_other_rounding():
