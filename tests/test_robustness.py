@@ -146,6 +146,25 @@ def test_scenes_are_what_their_names_say():
     assert not can_be_studied(small_scene())
 
 
+def test_a_robot_that_goes_to_the_left_has_room_there():
+    scene = on_ground(direction=(-1.0, 0.0), steps=20)
+    robot = robot_in(scene)
+    robot.keep[:5] = False
+    longer = lasting(scene, 20 * scene.time_step)
+    assert longer.grid.cells == (16 + 48, 16)
+    assert np.array_equal(robot.in_scene(longer), robot.keep)
+    ends = [parts(robot.body(each).run()).position for each in (scene, longer)]
+    assert np.allclose(ends[1] - ends[0], [[48 * C], [0.0]], atol=1e-9)
+    assert longer.ground[0].points[0] == (3.0, 3 * C)
+    mirrored = lasting(
+        small_scene(
+            body=(Solid((4 * C, 4 * C), (6 * C, 8 * C)),), walls=(), gravity=(0.0, 0.0),
+            direction=(0.0, -1.0), mirror=Mirror("x", 5 * C),
+        ), 0.1,
+    )  # fmt: skip
+    assert (mirrored.mirror, mirrored.grid.cells) == (Mirror("x", 5 * C), (16, 64))
+
+
 def test_a_robot_is_in_one_piece_and_the_same_on_other_cells():
     scene = on_ground()
     problem = Problem(scene, 8.0)

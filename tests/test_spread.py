@@ -17,6 +17,7 @@ from conftest import SHORT, small_scene
 from PIL import Image
 from test_robustness import on_ground, robot_in
 
+from mpmopt.__main__ import main
 from mpmopt.assess import robustness
 from mpmopt.design.problem import Problem
 from mpmopt.design.task import Task
@@ -105,7 +106,9 @@ def test_a_table_and_a_picture_have_all_robots(a_run, tmp_path, monkeypatch, cap
     assert (tmp_path / "spread.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_a_film_shows_a_robot_in_all_scenes_of_its_task(a_run, tmp_path, monkeypatch, caplog):
+def test_a_film_shows_a_robot_in_all_scenes_of_its_task(
+    a_run, tmp_path, monkeypatch, caplog, capsys
+):
     monkeypatch.setattr(ensemble, "SHOWN", 0.04)
     names: list[Any] = []
 
@@ -131,7 +134,9 @@ def test_a_film_shows_a_robot_in_all_scenes_of_its_task(a_run, tmp_path, monkeyp
     with Image.open(BytesIO((tmp_path / "scenes.gif").read_bytes())) as film:
         assert film.n_frames == filmed.frames == 5
     names.clear()
-    ensemble.film_scenes(tmp_path / "scenes.gif", a_run, 0.2)
+    runfile.write(tmp_path / "run.h5", a_run)
+    assert main(["scenes", str(tmp_path / "run.h5"), "--seconds", "0.2"]) == 0
+    assert f"{tmp_path / 'scenes.gif'}: 5 frames" in capsys.readouterr().out
     assert names == [f"friction {value:g}" for value in robustness.FEW_FRICTIONS]
     with pytest.raises(DesignError, match=r"ends in '\.avi'"):
         ensemble.film_scenes(tmp_path / "scenes.avi", a_run, 0.2)

@@ -79,12 +79,22 @@ class Robot:
         return cls(problem, keep & held, problem.split(x))
 
     def in_scene(self, scene: Scene) -> NDArray[np.bool_]:
-        """Which design particles of another scene are there: those whose nearest one is."""
-        return self.keep[nearest_designed(discretise(scene), self.problem.particles)]
+        """Which design particles of another scene are there: those whose nearest one is.
+
+        Where the body begins otherwise, all of it was moved.
+        """
+        there = discretise(scene)
+        moved = _corner(scene) - _corner(self.problem.scene)
+        there = replace(there, position=there.position - moved)
+        return self.keep[nearest_designed(there, self.problem.particles)]
 
     def body(self, scene: Scene) -> Simulation:
         """The robot in a scene, which may have other cells."""
         return solid_body(scene, self.in_scene(scene), self.variables)
+
+
+def _corner(scene: Scene) -> NDArray[np.float64]:
+    return np.min([region.lower for region in scene.body], axis=0)
 
 
 def can_be_studied(scene: Scene) -> bool:
@@ -105,13 +115,36 @@ def whole_periods(scene: Scene, begin: float, end: float) -> float:
 
 def lasting(scene: Scene, seconds: float) -> Scene:
     """The scene for another time, all of which counts, and with room for the way."""
-    cells = list(scene.grid.cells)
-    for k in (0, 1):
-        if scene.direction[k] > 0.0:
-            cells[k] += math.ceil(ROOM * max(scene.extent) / scene.grid.dx)
-    grid = Grid((cells[0], cells[1]), scene.grid.dx)
+    room = math.ceil(ROOM * max(scene.extent) / scene.grid.dx)
+    more = [room if component else 0 for component in scene.direction]
+    behind = [room if component < 0.0 else 0 for component in scene.direction]
+    nx, ny = (n + cells for n, cells in zip(scene.grid.cells, more))
     steps = max(1, math.ceil(seconds / scene.time_step - 1e-6))
-    return replace(scene, grid=grid, steps=steps, transient=0.0)
+    moved = _moved(scene, behind[0] * scene.grid.dx, behind[1] * scene.grid.dx)
+    grid = Grid((nx, ny), scene.grid.dx)
+    return replace(scene, **moved, grid=grid, steps=steps, transient=0.0)
+
+
+def _moved(scene: Scene, dx: float, dy: float) -> dict[str, Any]:
+    """What of a scene has a place, all of it moved."""
+
+    def at(point: tuple[float, float]) -> tuple[float, float]:
+        return point[0] + dx, point[1] + dy
+
+    def boxes(items: tuple[Any, ...]) -> tuple[Any, ...]:
+        return tuple(replace(each, lower=at(each.lower), upper=at(each.upper)) for each in items)
+
+    def planes(items: tuple[Any, ...]) -> tuple[Any, ...]:
+        along = {"x": dx, "y": dy}
+        return tuple(replace(each, position=each.position + along[each.axis]) for each in items)
+
+    return {
+        "body": boxes(scene.body),
+        "clamps": boxes(scene.clamps),
+        "walls": planes(scene.walls),
+        "mirror": scene.mirror and planes((scene.mirror,))[0],
+        "ground": tuple(replace(each, points=tuple(map(at, each.points))) for each in scene.ground),
+    }
 
 
 def refined(scene: Scene, multiple: float = 1.0, formulation: Formulation | None = None) -> Scene:
