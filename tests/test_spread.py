@@ -155,7 +155,7 @@ def test_a_stride_is_one_period_and_a_gait_has_its_feet(tmp_path, monkeypatch):
     figures: list[Any] = []
     monkeypatch.setattr(gait, "png", figures.append)
     monkeypatch.setattr(gait, "replace_file", lambda path, content: None)
-    monkeypatch.setattr(gait, "period", lambda scene: 0.04)
+    monkeypatch.setattr(robustness.Robot, "period", lambda self, scene: 0.04)
     robot = robot_in(on_ground())
     gait.plot_stride(tmp_path / "a.png", robot)
     gait.plot_gait(tmp_path / "b.png", robot)

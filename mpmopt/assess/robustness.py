@@ -92,6 +92,10 @@ class Robot:
         """The robot in a scene, which may have other cells."""
         return solid_body(scene, self.in_scene(scene), self.variables)
 
+    def period(self, scene: Scene) -> float:
+        """Of the slowest actuator in a scene."""
+        return 2.0 * math.pi / min(each.angular_frequency for each in scene.actuators)
+
 
 def _corner(scene: Scene) -> NDArray[np.float64]:
     return np.min([region.lower for region in scene.body], axis=0)
@@ -102,15 +106,9 @@ def can_be_studied(scene: Scene) -> bool:
     return bool(scene.actuators and scene.ground)
 
 
-def period(scene: Scene) -> float:
-    """Of the slowest actuator."""
-    return 2.0 * math.pi / min(actuator.angular_frequency for actuator in scene.actuators)
-
-
-def whole_periods(scene: Scene, begin: float, end: float) -> float:
+def whole_periods(period: float, begin: float, end: float) -> float:
     """The time until which as many whole periods have passed since `begin` as there is room for."""
-    one = period(scene)
-    return begin + max(1, math.floor((end - begin) / one + 1e-9)) * one
+    return begin + max(1, math.floor((end - begin) / period + 1e-9)) * period
 
 
 def lasting(scene: Scene, seconds: float) -> Scene:
@@ -219,7 +217,7 @@ def speed(robot: Robot, trial: Trial, most_work: float = math.inf) -> float:
     """
     scene = trial.scene()
     begin = RECOVERED if trial.pushed else SETTLED
-    end = whole_periods(scene, begin, SEEN)
+    end = whole_periods(robot.period(scene), begin, SEEN)
     scene = lasting(scene, end)
     simulation = robot.body(scene)
     work = float(simulation.initial.shape[1]) * scene.steps
@@ -266,7 +264,7 @@ def follow(robot: Robot, scene: Scene) -> Followed:
     """
     scene = lasting(scene, FOLLOWED)
     simulation = robot.body(scene)
-    every = max(1, round(0.25 * period(scene) / scene.time_step))
+    every = max(1, round(0.25 * robot.period(scene) / scene.time_step))
     frames = np.arange(0, scene.steps + 1, every)
     time = scene.time_step * frames
     try:

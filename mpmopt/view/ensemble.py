@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mpmopt.assess.robustness import FEW_FRICTIONS, Robot, lasting, period
+from mpmopt.assess.robustness import FEW_FRICTIONS, Robot, lasting
 from mpmopt.assess.trajectory import Motion, equal_steps
 from mpmopt.design.variation import Variation
 from mpmopt.errors import DesignError, SimulationError
@@ -76,5 +76,5 @@ def film_scenes(path: Path, run: Optimisation, seconds: float = SECONDS) -> Film
 
         content = encoded(path, frames())
     replace_file(path, content)
-    per_period = count * period(problem.scene) / SHOWN
+    per_period = count * robot.period(problem.scene) / SHOWN
     return Filmed(count, seconds + LAST, seconds / SHOWN, per_period, len(content))
