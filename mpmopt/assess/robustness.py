@@ -6,10 +6,9 @@ A robot is what would be built: without grey and void, and without what hangs on
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, replace
+from threading import Lock
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,6 +17,7 @@ from scipy.ndimage import label
 
 from mpmopt.assess import threshold
 from mpmopt.assess.threshold import SOLID_LIMITS, solid_body
+from mpmopt.design.ensemble import side_by_side
 from mpmopt.design.objective import Objective
 from mpmopt.design.problem import Problem, Variables
 from mpmopt.design.step_control import check_indicators
@@ -27,7 +27,6 @@ from mpmopt.scene import Grid, Scene
 from mpmopt.scene.particles import Particles, discretise, mirror_images, nearest_designed
 from mpmopt.scene.scene import LAGRANGIAN_LIMIT, Formulation
 from mpmopt.simulation.simulation import Simulation
-from mpmopt.simulation.threads import threads
 
 # In the scene's unit of time: what comes before does not count, and when a speed has been seen.
 SETTLED, SEEN, FOLLOWED = 2.0, 8.0, 20.0
@@ -383,7 +382,8 @@ def study(
     found: dict[str, Any] = {"components": components(scene, threshold.kept(problem, x))}
     if not can_be_studied(scene):
         return found
-    speeds, failures = _speeds(robot, _trials(scene, full), full, progress)
+    most_work = MOST_WORK_FULL if full else MOST_WORK
+    speeds, failures = _speeds(robot, _trials(scene, full), most_work, progress)
     nominal = speeds["nominal"]
     for kind in ("cells", "step", "strength", "frequency"):
         speeds[f"{kind} 1"] = nominal
@@ -466,27 +466,25 @@ def _trials(scene: Scene, full: bool) -> dict[str, Trial]:
 def _speeds(
     robot: Robot,
     trials: dict[str, Trial],
-    full: bool,
+    most_work: float,
     progress: Callable[[str, float], None] | None,
 ) -> tuple[dict[str, float | None], dict[str, str]]:
     """The speed of each trial, None where there is none, and why."""
     speeds: dict[str, float | None] = dict.fromkeys(trials)
     failures: dict[str, str] = {}
-    most = MOST_WORK_FULL if full else MOST_WORK
-    with ThreadPoolExecutor(max(1, (os.cpu_count() or 1) // threads())) as pool:
-        runs = {pool.submit(speed, robot, trial, most): name for name, trial in trials.items()}
+    one_at_a_time = Lock()
+
+    def run(name: str) -> None:
+        value = math.nan
         try:
-            for done in as_completed(runs):
-                name, value = runs[done], math.nan
-                try:
-                    value = speeds[name] = done.result()
-                except SimulationError as error:
-                    failures[name] = error.what
-                except SceneError as error:
-                    failures[name] = str(error)
-                if progress is not None:
-                    progress(name, value)
-        finally:
-            for run in runs:  # after an interrupt, those that have not begun
-                run.cancel()
-    return speeds, failures
+            value = speeds[name] = speed(robot, trials[name], most_work)
+        except SimulationError as error:
+            failures[name] = error.what
+        except SceneError as error:
+            failures[name] = str(error)
+        if progress is not None:
+            with one_at_a_time:
+                progress(name, value)
+
+    side_by_side(run, list(trials))
+    return speeds, {name: failures[name] for name in trials if name in failures}
