@@ -49,7 +49,7 @@ NAMES = (
     "speed_by_frequency", "speed_by_step", "speed_by_cells", "followed", "components",
 )  # fmt: skip
 # Particles times steps of one run, in the short study and in the full: longer ones are left out.
-MOST_WORK, MOST_WORK_FULL = 3e8, 5e9
+MOST_WORK, MOST_WORK_FULL = 1.5e8, 5e9
 
 
 @dataclass(frozen=True)
