@@ -7,7 +7,9 @@ import argparse
 import csv
 import io
 import json
+import math
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,34 +17,46 @@ from mpmopt.io.files import replace_file
 from mpmopt.validation import digits
 
 HEADER = (
-    "robot", "start", "optimised", "without grey", "gain over the solid block",
-    "of it with the actuation off", "gain left at half the step", "on cells half as wide",
-    "disconnected particles", "gradients", "of them failed", "seconds",
+    "robot", "mean speed", "worst at friction 0.3 to 0.8", "kept at half the step",
+    "on cells half as wide", "a quarter as wide", "in the other formulation", "driven share",
+    "pieces", "thinnest member", "goes on for", "without grey, over the solid block",
+    "gradients", "of them failed", "seconds",
 )  # fmt: skip
 
 
-def row(folder: Path) -> list[str]:
-    """What the summary of a run says."""
-    summary: dict[str, Any] = json.loads((folder / "summary.json").read_text())
-    reference, retained = summary["reference"], summary["retained_gain"]
+def worst(summary: Mapping[str, Any], low: float = 0.3, high: float = 0.8) -> float:
+    """The least speed over frictions of a summary; not a number if one of them has none."""
+    frictions = summary.get("speed_by_friction", {}).items()
+    values = [value for name, value in frictions if low <= float(name) <= high]
+    return min(values) if values and None not in values else math.nan
 
-    def over(value: float | None) -> str:
-        return "-" if value is None or reference is None else f"{value - reference:.3f}"
+
+def row(folder: Path) -> list[str]:
+    """What the summary of a run says; a dash where it says nothing."""
+    summary: dict[str, Any] = json.loads((folder / "summary.json").read_text())
+    kept, followed = summary.get("kept", {}), summary.get("followed", {})
+    solid, block = summary["post_processed"], summary["reference"]
+
+    def number(value: float | None) -> str:
+        return "-" if value is None or math.isnan(value) else digits(value, 3)
 
     def share(value: float | None) -> str:
         return "-" if value is None else f"{value:.0%}"
 
-    def number(value: float | None) -> str:
-        return "-" if value is None else digits(value)
-
+    end = followed.get("end", "goes on")
     return [
         folder.name,
-        *(number(summary[name]) for name in ("start", "optimised", "post_processed")),
-        over(summary["post_processed"]),
-        over(summary["actuation_off"]),
-        share(retained["half the step"]),
-        share(retained["cells half as wide"]),
-        str(summary["disconnected_particles"]),
+        number(summary.get("speed")),
+        number(worst(summary)),
+        *(
+            share(kept.get(name))
+            for name in ("half_step", "finer_cells", "finest_cells", "other_formulation")
+        ),
+        share(summary.get("driven_share")),
+        str(summary.get("components", "-")),
+        number(summary.get("thinnest_member")),
+        number(followed.get("seconds")) + ("" if end == "goes on" else f", {end}"),
+        number(None if solid is None or block is None else solid - block),
         str(summary["evaluations"]),
         str(summary["failed_evaluations"]),
         f"{summary['seconds']:.0f}",

@@ -136,6 +136,19 @@ def postprocess(path: Path, threshold: float) -> int:
     return 0
 
 
+def scenes(path: Path, out: Path | None, seconds: float, force: bool) -> int:
+    """Write a film of a run's finished robot in all scenes of its task, side by side."""
+    from mpmopt.io.files import make_folder, refuse_existing
+    from mpmopt.view.ensemble import film_scenes
+
+    run = _read(path).run
+    target = out or path.parent / "scenes.gif"
+    refuse_existing([target] if out else (), force)
+    make_folder(target.parent)
+    print(f"{target}: {film_scenes(target, run, seconds)}")
+    return 0
+
+
 def study(path: Path) -> int:
     """Print whether a run's best design keeps its gain and goes elsewhere; keep it in the run."""
     import numpy as np
@@ -379,6 +392,18 @@ def _parser() -> argparse.ArgumentParser:
         "--threshold", type=float, default=0.3, help="gamma from which a particle stays (0.3)"
     )
     command.set_defaults(do=postprocess)
+
+    command = add(
+        "scenes",
+        "film its finished robot in all scenes of its task",
+        "Write a film of the best design, without void and what hangs on nothing, in all scenes\n"
+        "of the run's task at once, from rest; on ground of several frictions if it has only one.",
+        "out/walker/run.h5",
+        "out/walker/run.h5 --out walker.mp4",
+    )
+    add_place(command, "FILE", "ends in .gif or .mp4 (default: scenes.gif there)")
+    command.add_argument("--seconds", type=float, default=10.0, help="that it plays (10)")
+    command.set_defaults(do=scenes)
 
     command = add(
         "study",

@@ -96,12 +96,12 @@ def test_a_speed_is_the_way_over_the_time_in_whole_periods(formulation, soon):
     scene = on_ground(formulation, gravity=(g, 0.0), body=body, time_step=2e-3)
     problem = Problem(scene)
     robot = Robot.of(problem, problem.join(np.empty(0), 0.0, 0.0, 0.0))
-    end = whole_periods(scene, 0.02, 0.16)
+    end = whole_periods(robot.period(scene), 0.02, 0.16)
     assert end == pytest.approx(0.02 + 2 * (2.0 * np.pi / omega))
     assert speed(robot, Trial(lambda: scene)) == pytest.approx(g * (0.02 + end) / 2, rel=0.02)
     pushed = speed(robot, Trial(lambda: scene, pushed=True))
     back = robustness.PUSH * scene.wave_speed
-    later = whole_periods(scene, 0.024, 0.16)
+    later = whole_periods(robot.period(scene), 0.024, 0.16)
     assert pushed == pytest.approx(g * (0.024 + later) / 2 - back, rel=0.02)
     with pytest.raises(SceneError, match="particles times steps"):
         speed(robot, Trial(lambda: scene), most_work=100.0)
@@ -140,10 +140,29 @@ def test_scenes_are_what_their_names_say():
     strong = with_actuators(scene, strength=1.2, frequency=0.8).actuators
     assert strong[0].stress == ((2.4, 0.6), (0.6, 1.2))
     assert [each.angular_frequency for each in strong] == [24.0, 40.0]
-    assert robustness.period(scene) == pytest.approx(2 * np.pi / 30.0)
+    assert robot_in(scene).period(scene) == pytest.approx(2 * np.pi / 30.0)
     with pytest.raises(SceneError, match="no whole number"):
         refined(on_ground(grid=Grid((17, 16), C)), 0.5)
     assert not can_be_studied(small_scene())
+
+
+def test_a_robot_that_goes_to_the_left_has_room_there():
+    scene = on_ground(direction=(-1.0, 0.0), steps=20)
+    robot = robot_in(scene)
+    robot.keep[:5] = False
+    longer = lasting(scene, 20 * scene.time_step)
+    assert longer.grid.cells == (16 + 48, 16)
+    assert np.array_equal(robot.in_scene(longer), robot.keep)
+    ends = [parts(robot.body(each).run()).position for each in (scene, longer)]
+    assert np.allclose(ends[1] - ends[0], [[48 * C], [0.0]], atol=1e-9)
+    assert longer.ground[0].points[0] == (3.0, 3 * C)
+    mirrored = lasting(
+        small_scene(
+            body=(Solid((4 * C, 4 * C), (6 * C, 8 * C)),), walls=(), gravity=(0.0, 0.0),
+            direction=(0.0, -1.0), mirror=Mirror("x", 5 * C),
+        ), 0.1,
+    )  # fmt: skip
+    assert (mirrored.mirror, mirrored.grid.cells) == (Mirror("x", 5 * C), (16, 64))
 
 
 def test_a_robot_is_in_one_piece_and_the_same_on_other_cells():
@@ -260,7 +279,7 @@ def test_a_robot_is_followed_until_it_falls_or_stops(monkeypatch, end, way, heig
     scene = on_ground()
     monkeypatch.setattr(robustness, "FOLLOWED", 20.0)
     robot = robot_in(scene)
-    every = round(0.25 * robustness.period(scene) / scene.time_step) * scene.time_step
+    every = round(0.25 * robot_in(scene).period(scene) / scene.time_step) * scene.time_step
 
     class Still:
         particles = None

@@ -6,10 +6,9 @@ A robot is what would be built: without grey and void, and without what hangs on
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, replace
+from threading import Lock
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,6 +17,7 @@ from scipy.ndimage import label
 
 from mpmopt.assess import threshold
 from mpmopt.assess.threshold import SOLID_LIMITS, solid_body
+from mpmopt.design.ensemble import side_by_side
 from mpmopt.design.objective import Objective
 from mpmopt.design.problem import Problem, Variables
 from mpmopt.design.step_control import check_indicators
@@ -27,7 +27,6 @@ from mpmopt.scene import Grid, Scene
 from mpmopt.scene.particles import Particles, discretise, mirror_images, nearest_designed
 from mpmopt.scene.scene import LAGRANGIAN_LIMIT, Formulation
 from mpmopt.simulation.simulation import Simulation
-from mpmopt.simulation.threads import threads
 
 # In the scene's unit of time: what comes before does not count, and when a speed has been seen.
 SETTLED, SEEN, FOLLOWED = 2.0, 8.0, 20.0
@@ -50,7 +49,7 @@ NAMES = (
     "speed_by_frequency", "speed_by_step", "speed_by_cells", "followed", "components",
 )  # fmt: skip
 # Particles times steps of one run, in the short study and in the full: longer ones are left out.
-MOST_WORK, MOST_WORK_FULL = 3e8, 5e9
+MOST_WORK, MOST_WORK_FULL = 1.5e8, 5e9
 
 
 @dataclass(frozen=True)
@@ -79,12 +78,26 @@ class Robot:
         return cls(problem, keep & held, problem.split(x))
 
     def in_scene(self, scene: Scene) -> NDArray[np.bool_]:
-        """Which design particles of another scene are there: those whose nearest one is."""
-        return self.keep[nearest_designed(discretise(scene), self.problem.particles)]
+        """Which design particles of another scene are there: those whose nearest one is.
+
+        Where the body begins otherwise, all of it was moved.
+        """
+        there = discretise(scene)
+        moved = _corner(scene) - _corner(self.problem.scene)
+        there = replace(there, position=there.position - moved)
+        return self.keep[nearest_designed(there, self.problem.particles)]
 
     def body(self, scene: Scene) -> Simulation:
         """The robot in a scene, which may have other cells."""
         return solid_body(scene, self.in_scene(scene), self.variables)
+
+    def period(self, scene: Scene) -> float:
+        """Of the slowest actuator in a scene."""
+        return 2.0 * math.pi / min(each.angular_frequency for each in scene.actuators)
+
+
+def _corner(scene: Scene) -> NDArray[np.float64]:
+    return np.min([region.lower for region in scene.body], axis=0)
 
 
 def can_be_studied(scene: Scene) -> bool:
@@ -92,26 +105,43 @@ def can_be_studied(scene: Scene) -> bool:
     return bool(scene.actuators and scene.ground)
 
 
-def period(scene: Scene) -> float:
-    """Of the slowest actuator."""
-    return 2.0 * math.pi / min(actuator.angular_frequency for actuator in scene.actuators)
-
-
-def whole_periods(scene: Scene, begin: float, end: float) -> float:
+def whole_periods(period: float, begin: float, end: float) -> float:
     """The time until which as many whole periods have passed since `begin` as there is room for."""
-    one = period(scene)
-    return begin + max(1, math.floor((end - begin) / one + 1e-9)) * one
+    return begin + max(1, math.floor((end - begin) / period + 1e-9)) * period
 
 
 def lasting(scene: Scene, seconds: float) -> Scene:
     """The scene for another time, all of which counts, and with room for the way."""
-    cells = list(scene.grid.cells)
-    for k in (0, 1):
-        if scene.direction[k] > 0.0:
-            cells[k] += math.ceil(ROOM * max(scene.extent) / scene.grid.dx)
-    grid = Grid((cells[0], cells[1]), scene.grid.dx)
+    room = math.ceil(ROOM * max(scene.extent) / scene.grid.dx)
+    more = [room if component else 0 for component in scene.direction]
+    behind = [room if component < 0.0 else 0 for component in scene.direction]
+    nx, ny = (n + cells for n, cells in zip(scene.grid.cells, more))
     steps = max(1, math.ceil(seconds / scene.time_step - 1e-6))
-    return replace(scene, grid=grid, steps=steps, transient=0.0)
+    moved = _moved(scene, behind[0] * scene.grid.dx, behind[1] * scene.grid.dx)
+    grid = Grid((nx, ny), scene.grid.dx)
+    return replace(scene, **moved, grid=grid, steps=steps, transient=0.0)
+
+
+def _moved(scene: Scene, dx: float, dy: float) -> dict[str, Any]:
+    """What of a scene has a place, all of it moved."""
+
+    def at(point: tuple[float, float]) -> tuple[float, float]:
+        return point[0] + dx, point[1] + dy
+
+    def boxes(items: tuple[Any, ...]) -> tuple[Any, ...]:
+        return tuple(replace(each, lower=at(each.lower), upper=at(each.upper)) for each in items)
+
+    def planes(items: tuple[Any, ...]) -> tuple[Any, ...]:
+        along = {"x": dx, "y": dy}
+        return tuple(replace(each, position=each.position + along[each.axis]) for each in items)
+
+    return {
+        "body": boxes(scene.body),
+        "clamps": boxes(scene.clamps),
+        "walls": planes(scene.walls),
+        "mirror": scene.mirror and planes((scene.mirror,))[0],
+        "ground": tuple(replace(each, points=tuple(map(at, each.points))) for each in scene.ground),
+    }
 
 
 def refined(scene: Scene, multiple: float = 1.0, formulation: Formulation | None = None) -> Scene:
@@ -186,7 +216,7 @@ def speed(robot: Robot, trial: Trial, most_work: float = math.inf) -> float:
     """
     scene = trial.scene()
     begin = RECOVERED if trial.pushed else SETTLED
-    end = whole_periods(scene, begin, SEEN)
+    end = whole_periods(robot.period(scene), begin, SEEN)
     scene = lasting(scene, end)
     simulation = robot.body(scene)
     work = float(simulation.initial.shape[1]) * scene.steps
@@ -233,7 +263,7 @@ def follow(robot: Robot, scene: Scene) -> Followed:
     """
     scene = lasting(scene, FOLLOWED)
     simulation = robot.body(scene)
-    every = max(1, round(0.25 * period(scene) / scene.time_step))
+    every = max(1, round(0.25 * robot.period(scene) / scene.time_step))
     frames = np.arange(0, scene.steps + 1, every)
     time = scene.time_step * frames
     try:
@@ -352,7 +382,8 @@ def study(
     found: dict[str, Any] = {"components": components(scene, threshold.kept(problem, x))}
     if not can_be_studied(scene):
         return found
-    speeds, failures = _speeds(robot, _trials(scene, full), full, progress)
+    most_work = MOST_WORK_FULL if full else MOST_WORK
+    speeds, failures = _speeds(robot, _trials(scene, full), most_work, progress)
     nominal = speeds["nominal"]
     for kind in ("cells", "step", "strength", "frequency"):
         speeds[f"{kind} 1"] = nominal
@@ -435,23 +466,25 @@ def _trials(scene: Scene, full: bool) -> dict[str, Trial]:
 def _speeds(
     robot: Robot,
     trials: dict[str, Trial],
-    full: bool,
+    most_work: float,
     progress: Callable[[str, float], None] | None,
 ) -> tuple[dict[str, float | None], dict[str, str]]:
     """The speed of each trial, None where there is none, and why."""
     speeds: dict[str, float | None] = dict.fromkeys(trials)
     failures: dict[str, str] = {}
-    most = MOST_WORK_FULL if full else MOST_WORK
-    with ThreadPoolExecutor(max(1, (os.cpu_count() or 1) // threads())) as pool:
-        runs = {pool.submit(speed, robot, trial, most): name for name, trial in trials.items()}
-        for done in as_completed(runs):
-            name = runs[done]
-            try:
-                speeds[name] = done.result()
-            except SimulationError as error:
-                failures[name] = error.what
-            except SceneError as error:
-                failures[name] = str(error)
-            if progress is not None:
-                progress(name, math.nan if speeds[name] is None else float(speeds[name] or 0.0))
-    return speeds, failures
+    one_at_a_time = Lock()
+
+    def run(name: str) -> None:
+        value = math.nan
+        try:
+            value = speeds[name] = speed(robot, trials[name], most_work)
+        except SimulationError as error:
+            failures[name] = error.what
+        except SceneError as error:
+            failures[name] = str(error)
+        if progress is not None:
+            with one_at_a_time:
+                progress(name, value)
+
+    side_by_side(run, list(trials))
+    return speeds, {name: failures[name] for name in trials if name in failures}

@@ -340,3 +340,19 @@ def _mp4(frames: Iterator[NDArray[np.uint8]]) -> bytes:
     if b"moov" not in content:  # its tables, which come last
         raise StorageError("ffmpeg wrote no whole film; make room for temporary files")
     return content
+
+
+def encoded(path: Path, frames: Iterator[NDArray[np.uint8]]) -> bytes:
+    """Frames as the content of a film of the kind that a path's ending names.
+
+    Raises
+    ------
+    DesignError
+        If it names none.
+    MissingLibraryError, StorageError
+        As `film`.
+    """
+    writers = {".gif": _gif, ".mp4": _mp4}
+    if path.suffix.lower() not in writers:
+        raise DesignError(f"{path} ends in {path.suffix!r}, a film in one of {sorted(writers)}")
+    return writers[path.suffix.lower()](frames)

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, label
 
-from mpmopt.assess.robustness import SEEN, SETTLED, Robot, lasting, period
+from mpmopt.assess.robustness import SEEN, SETTLED, Robot, lasting
 from mpmopt.assess.trajectory import Body, Motion
 from mpmopt.design.terms import Displacement
 from mpmopt.io.files import replace_file
@@ -62,7 +62,7 @@ def plot_stride(path: str | os.PathLike[str], robot: Robot) -> None:
     StorageError
         If the file cannot be written.
     """
-    one = period(robot.problem.scene)
+    one = robot.period(robot.problem.scene)
     scene = lasting(robot.problem.scene, SETTLED + one)
     times = SETTLED + one * np.arange(INSTANTS) / INSTANTS
     frames = np.rint(times / scene.time_step).astype(int)
@@ -159,7 +159,7 @@ def plot_gait(path: str | os.PathLike[str], robot: Robot) -> None:
     StorageError
         If the file cannot be written.
     """
-    one = period(robot.problem.scene)
+    one = robot.period(robot.problem.scene)
     scene = lasting(robot.problem.scene, SEEN)
     far = np.arange(0.0, SEEN, one / 8.0)
     near = SETTLED + one * np.arange(PERIODS * PER_PERIOD + 1) / PER_PERIOD

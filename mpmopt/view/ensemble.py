@@ -1,0 +1,80 @@
+"""A film of a finished robot in several scenes at once, side by side."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpmopt.assess.robustness import FEW_FRICTIONS, Robot, lasting
+from mpmopt.assess.trajectory import Motion, equal_steps
+from mpmopt.design.variation import Variation
+from mpmopt.errors import DesignError, SimulationError
+from mpmopt.io.files import replace_file
+from mpmopt.io.progress import Progress
+from mpmopt.optimisation.history import Optimisation
+from mpmopt.view.film import LAST, RATE, Filmed, Screen, encoded
+from mpmopt.view.gait import body_of
+
+logger = logging.getLogger(__name__)
+
+SHOWN = 4.0  # of the scene's time
+SECONDS = 10.0  # that the film takes for it
+
+
+def film_scenes(path: Path, run: Optimisation, seconds: float = SECONDS) -> Filmed:
+    """Write a film of a run's finished robot in all scenes of its task, from rest.
+
+    In scenes of several frictions if the task has none of its own. Where it cannot be simulated,
+    a scene is left out.
+
+    Parameters
+    ----------
+    path : Path
+        As in `film.film`.
+    run : Optimisation
+    seconds : float, optional
+        That the film plays.
+
+    Raises
+    ------
+    DesignError
+        If the run has no design or no ground, `path` has another ending, `seconds` makes no sense,
+        or no scene can be simulated.
+    MissingLibraryError, StorageError
+        As `film.film`.
+    """
+    problem = run.problem()
+    if not problem.scene.ground or not problem.scene.actuators:
+        raise DesignError(
+            "film: only robots on ground, with actuators, are filmed in several scenes"
+        )
+    count = round(seconds * RATE) if 0.0 < seconds <= 600.0 else 0
+    if count < 2:
+        raise DesignError(f"film: seconds = {seconds!r} must be from {2 / RATE:g} to 600")
+    scenes = run.task.scenes or tuple(Variation(friction=value) for value in FEW_FRICTIONS)
+    robot, motions = Robot.of(problem, run.result.x), []
+    for variation in scenes:
+        try:
+            scene = lasting(variation.scene(problem.scene), SHOWN)
+            body = body_of(robot, scene, str(variation))
+            motions.append(Motion.of(body, equal_steps(scene, count)))
+        except SimulationError as error:
+            logger.warning("the film is without the scene of %s: %s", variation, error)
+    if not motions:
+        raise DesignError("film: the robot cannot be simulated in any of its scenes")
+    screen = Screen(motions, seconds / SHOWN)
+    with Progress("frames", count) as progress:
+
+        def frames() -> Iterator[NDArray[np.uint8]]:
+            for number in range(count):
+                yield screen.frame(number)
+                progress.step()
+
+        content = encoded(path, frames())
+    replace_file(path, content)
+    per_period = count * robot.period(problem.scene) / SHOWN
+    return Filmed(count, seconds + LAST, seconds / SHOWN, per_period, len(content))
