@@ -195,6 +195,22 @@ def test_sweep_is_a_name_of_the_package():
     assert Outcome({}).error == ""
 
 
+def test_an_interrupt_waits_until_the_executor_has_let_go_of_its_locks(store):
+    left = []
+
+    class Interrupted(ThreadPoolExecutor):
+        def submit(self, fn, /, *args, **kwargs):
+            signal.raise_signal(signal.SIGINT)
+            left.append(1)  # a lock, in the real one
+            return super().submit(fn, *args, **kwargs)
+
+    with Interrupted(1) as executor, pytest.raises(KeyboardInterrupt):
+        sweep(square, points(3), store, executor)
+    assert left == [1, 1, 1]
+    with ThreadPoolExecutor(1) as others:
+        assert squares(sweep(square, points(3), store, others)) == {0: 0, 1: 1, 2: 4}
+
+
 # Processes of this machine.
 
 
@@ -347,8 +363,7 @@ def end_a_client(number, store, log, go, scheduler):
     ("where", "number"),
     [
         ("processes", signal.SIGKILL),
-        # Sometimes joblib's processes wait for ever on a busy machine; the cause is not found.
-        pytest.param("processes", signal.SIGINT, marks=pytest.mark.slow),
+        ("processes", signal.SIGINT),
         ("cluster", signal.SIGKILL),
     ],
 )
