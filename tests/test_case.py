@@ -14,11 +14,12 @@ import numpy as np
 import pytest
 from walker import CASES, slanted_legs, walker
 
-from mpmopt.app.case import START, Case, ProgressBar, resume, run
+from mpmopt.app.case import Case, ProgressBar, resume, run
 from mpmopt.app.script import main
 from mpmopt.assess.threshold import pieces
 from mpmopt.design.problem import Problem
 from mpmopt.design.task import Task
+from mpmopt.design.variables import START
 from mpmopt.errors import DesignError, RunFileError, StorageError
 from mpmopt.optimisation.loop import optimise
 from mpmopt.optimisation.presets import IN_ONE_PIECE

@@ -15,8 +15,6 @@ from mpmopt.scene import Scene
 from mpmopt.scene.parts import Checked
 from mpmopt.validation import count, number, shown
 
-ROUNDING = 1e-12  # by which a tied variable may be out of its bounds
-
 
 class Variables(NamedTuple):
     """Design variables by name, each within [-1, 1]; the vector x is them in this order.
@@ -272,22 +270,8 @@ class Freedom:
         self._free[entries[low == high]] = False
 
     def started(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """A start (n,) moved to where all that is restricted may be.
-
-        Raises
-        ------
-        DesignError
-            If what stays as it starts leads something tied out of its bounds.
-        """
-        x = self._followed(np.clip(x, self._low, self._high))
-        wrong = (x < self._low - ROUNDING) | (x > self._high + ROUNDING)
-        if np.any(wrong):
-            j = int(np.argmax(wrong))
-            raise DesignError(
-                f"x[{j}] = {x[j]:g} follows what is frozen and is not within [{self._low[j]:g}, "
-                f"{self._high[j]:g}]; start elsewhere"
-            )
-        return np.clip(x, self._low, self._high)
+        """A start (n,) moved to where all that is restricted may be."""
+        return np.clip(self._followed(np.clip(x, self._low, self._high)), self._low, self._high)
 
     def reduced(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """The free variables (m,) of a design (n,)."""
