@@ -131,6 +131,8 @@ def test_what_is_tied_narrows_the_range_of_what_it_follows():
     freedom = Freedom(SCENE, 38, (later, Bounded("theta", 1, upper=0.75)))
     assert freedom.upper[-3] == 0.25  # phi, a, theta of the first, b
     assert Variables.of(freedom.started(np.ones(38)), SCENE).theta.tolist() == [0.25, 0.75]
+    equal = Freedom(SCENE, 38, (Tied("b", to=1), Bounded("b", 1, upper=-0.5)))
+    assert Variables.of(equal.started(np.ones(38)), SCENE).b.tolist() == [-0.5, -0.5]
     reverse = Freedom(SCENE, 38, (Tied("b", to=1, factor=-0.5, shift=0.75),))
     assert (reverse.lower[-1], reverse.upper[-1]) == (-0.5, 1.0)
 

@@ -290,7 +290,7 @@ class Freedom:
     def pullback(self, x_bar: NDArray[np.float64]) -> NDArray[np.float64]:
         """Gradients (..., m) by the free variables from those by all (..., n)."""
         x_bar = x_bar.copy()
-        np.add.at(x_bar, (..., self._to), self._factor * x_bar[..., self._tied])
+        np.add.at(x_bar.T, self._to, (self._factor * x_bar[..., self._tied]).T)
         return x_bar[..., self._free]
 
 
