@@ -51,10 +51,10 @@ if TYPE_CHECKING:
     from mpmopt.design.terms import Effort as Effort
     from mpmopt.design.terms import Speed as Speed
     from mpmopt.design.terms import Volume as Volume
-    from mpmopt.design.variation import Variation as Variation
     from mpmopt.design.variables import Bounded as Bounded
     from mpmopt.design.variables import Frozen as Frozen
     from mpmopt.design.variables import Tied as Tied
+    from mpmopt.design.variation import Variation as Variation
     from mpmopt.optimisation.loop import optimise as optimise
     from mpmopt.optimisation.minimize import minimize as minimize
     from mpmopt.optimisation.settings import Settings as Settings

@@ -173,8 +173,7 @@ class Task(Checked):
 
 DEFAULT_TASK = Task()
 _KINDS = {
-    kind.__name__: kind
-    for kind in (Task, AtMost, Variation, Ground, Frozen, Bounded, Tied, *TERMS)
+    kind.__name__: kind for kind in (Task, AtMost, Variation, Ground, Frozen, Bounded, Tied, *TERMS)
 }
 
 
