@@ -166,8 +166,8 @@ def test_a_picture_that_fails_spoils_no_run(tmp_path, caplog, monkeypatch, how):
 
 def test_a_start_is_filled_up_and_knows_its_names():
     assert dataclasses.replace(TINY, start={"b": 0.1}).start == {**START, "b": 0.1}
-    with pytest.raises(DesignError, match="start has omega"):
-        dataclasses.replace(TINY, start={"omega": 0.1})
+    with pytest.raises(DesignError, match="start has gamma"):
+        dataclasses.replace(TINY, start={"gamma": 0.1})
 
 
 def test_what_a_folder_holds_is_overwritten_only_by_force(tmp_path):

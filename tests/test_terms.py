@@ -248,4 +248,5 @@ def test_json_holds_numbers_and_names_only():
         "subject_to": [{"kind": "AtMost", "term": {"kind": "Volume"}, "bound": 0.4}],
         "scenes": [],
         "soft_minimum": 0.0,
+        "variables": [],
     }
