@@ -24,6 +24,9 @@ _HOMES = {
     "AtMost": "mpmopt.design.task",
     "Displacement": "mpmopt.design.terms",
     "Speed": "mpmopt.design.terms",
+    "Height": "mpmopt.design.places",
+    "PeakHeight": "mpmopt.design.places",
+    "Distance": "mpmopt.design.places",
     "Effort": "mpmopt.design.terms",
     "Volume": "mpmopt.design.terms",
     "OnePiece": "mpmopt.design.one_piece",
@@ -41,6 +44,9 @@ if TYPE_CHECKING:
     from mpmopt.app.sweeps import sweep as sweep
     from mpmopt.assess.discretisation import cheapest as cheapest
     from mpmopt.design.one_piece import OnePiece as OnePiece
+    from mpmopt.design.places import Distance as Distance
+    from mpmopt.design.places import Height as Height
+    from mpmopt.design.places import PeakHeight as PeakHeight
     from mpmopt.design.problem import Problem as Problem
     from mpmopt.design.task import AtMost as AtMost
     from mpmopt.design.task import Task as Task
