@@ -448,7 +448,9 @@ def test_a_kerf_wider_than_a_member_or_a_gap_is_warned_of(holed, tmp_path, caplo
     done = export(problem, x, tmp_path, ["svg"], width=60.0, kerf=0.5 * (gap + member))
     assert done.detail == pytest.approx(60.0 / 48)
     (warning,) = caplog.messages
-    assert warning.startswith(f"the thinnest member is {member:.3g} mm wide, less than the kerf of ")
+    assert warning.startswith(
+        f"the thinnest member is {member:.3g} mm wide, less than the kerf of "
+    )
 
 
 def test_a_folder_that_cannot_be_made_is_a_storage_error(holed, tmp_path):
