@@ -27,6 +27,7 @@ _HOMES = {
     "Height": "mpmopt.design.places",
     "PeakHeight": "mpmopt.design.places",
     "Distance": "mpmopt.design.places",
+    "Driven": "mpmopt.design.driven",
     "Effort": "mpmopt.design.terms",
     "Volume": "mpmopt.design.terms",
     "OnePiece": "mpmopt.design.one_piece",
@@ -43,6 +44,7 @@ _HOMES = {
 if TYPE_CHECKING:
     from mpmopt.app.sweeps import sweep as sweep
     from mpmopt.assess.discretisation import cheapest as cheapest
+    from mpmopt.design.driven import Driven as Driven
     from mpmopt.design.one_piece import OnePiece as OnePiece
     from mpmopt.design.places import Distance as Distance
     from mpmopt.design.places import Height as Height

@@ -9,6 +9,7 @@ import pytest
 from conftest import small_scene, worst
 
 from mpmopt.assess.verify import complex_step_test, report
+from mpmopt.design.driven import Driven
 from mpmopt.design.places import Distance, Height, PeakHeight
 from mpmopt.design.problem import Problem
 from mpmopt.design.task import DEFAULT_TASK, AtMost, Task
@@ -39,6 +40,8 @@ def x(rng):
         PeakHeight(after=0.008),
         PeakHeight(region=2),
         Distance((0.3, 0.5)),
+        Driven(Displacement()),
+        Driven(PeakHeight() - 0.1 * Effort() + Volume()) + 0.5 * Driven(Speed(0.02)),
         Distance((0.31, 0.42), at=0.02, region=2) + Distance((0.3, 0.5), region=1),
         Effort(),
         Volume(),
@@ -121,6 +124,16 @@ def test_values_are_those_by_hand(x):
     assert start == pytest.approx(corner, abs=1e-14)
     whole = value(Displacement() - 0.5 * Effort())
     assert whole == pytest.approx(problem.value(x) - 0.5 * value(Effort()), abs=1e-15)
+
+
+def test_what_no_actuator_earns_is_not_driven(x):
+    problem = Problem(SCENE, 2.0, task=Task(Driven(Displacement())))
+    plain, variables = Problem(SCENE, 2.0), problem.split(x)
+    still = problem.join(variables.phi, 0.0, variables.theta, 0.0)
+    assert problem.value(still) == 0.0
+    assert problem.value(x) == pytest.approx(plain.value(x) - plain.value(still), abs=1e-15)
+    assert np.any(plain.evaluate(still).gradient[:32] != 0.0)
+    assert problem.evaluate(still).gradient[:32] == pytest.approx(0.0, abs=1e-15)
 
 
 def still(term: Term, rows: dict[int, tuple[float, float]]) -> float:
@@ -243,6 +256,7 @@ def test_a_design_that_can_hang_on_nothing_is_named(regions, says):
 def test_every_term_comes_back_from_json():
     made = {Displacement: Displacement((0.6, 0.8)), Speed: Speed(0.5, (0.0, -1.0))}
     made[Distance] = Distance((0.5, 0.25), at=0.5, region=2)
+    made[Driven] = Driven(Speed(0.25))
     made[Sum] = Sum(((1.0, Speed(0.25)), (-0.5, Sum(((2.0, Effort()),)))))
     for kind in TERMS:
         term = made.get(kind) or kind()
@@ -282,6 +296,7 @@ def test_an_own_term_needs_two_methods(x):
         (lambda: Displacement((1.0, 1.0)), r"has length 1.41421, must have 1"),
         (lambda: Speed(after=-1.0), "after = -1 must not be negative"),
         (lambda: Speed(period=-1.0), "period = -1 must not be negative"),
+        (lambda: Driven(0.4), "term = 0.4 .* class Term; such as"),
         (lambda: Height(at=-1.0), "Height: at = -1 must not be negative"),
         (lambda: Height(region=-1), "region = -1 must"),
         (lambda: Displacement(region=1.5), "region = 1.5 must be a whole number"),

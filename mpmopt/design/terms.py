@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from mpmopt.design.driven import Driven
 from mpmopt.design.objective import check_region
 from mpmopt.design.one_piece import OnePiece
 from mpmopt.design.places import Distance, Height, PeakHeight, centroid_of, region_number
@@ -171,6 +172,7 @@ TERMS: tuple[type[Term], ...] = (
     Height,
     PeakHeight,
     Distance,
+    Driven,
     Effort,
     Volume,
     OnePiece,
