@@ -136,6 +136,13 @@ def test_what_no_actuator_earns_is_not_driven(x):
     assert problem.evaluate(still).gradient[:32] == pytest.approx(0.0, abs=1e-15)
 
 
+def test_a_driven_term_is_of_what_is_simulated(x):
+    problem = Problem(SCENE, 2.0, void_cutoff=0.5, task=Task(Driven(Displacement())))
+    there = problem.present(problem.split(x).phi)
+    assert 16 < there.sum() < there.size
+    assert worst(complex_step_test(problem, x)) <= 1e-12
+
+
 def still(term: Term, rows: dict[int, tuple[float, float]]) -> float:
     """The value of a term of a body that is moved as a whole, by so much at steps."""
     simulation = Problem(SCENE).simulation(Problem(SCENE).join(0.0, 0.5, 0.0, 0.0))
