@@ -367,12 +367,13 @@ class Problem:
         phi, a, theta, _ = variables
         density_bar, stiffness_bar = np.zeros((2, len(self.particles.position)))
         signal_bar = np.zeros((self.scene.steps, a.size)) + bars.signal
-        present = self.present(phi)
-        density_bar[present], stiffness_bar[present] = bars.density, bars.stiffness
         if sweep is not None:
-            density_bar[present] += sweep.density
-            stiffness_bar[present] += sweep.stiffness
+            present = self.present(phi)
+            density_bar[present], stiffness_bar[present] = sweep.density, sweep.stiffness
             signal_bar = sweep.signal + bars.signal
+        if np.ndim(bars.density):  # of a term that simulates by itself
+            density_bar[self.present(phi)] += bars.density
+            stiffness_bar[self.present(phi)] += bars.stiffness
         phi_bar = self.chain.field(phi).pullback(density_bar, stiffness_bar, bars.gamma)
         return np.concatenate([phi_bar, *signal_adjoint(self.scene, a, theta, signal_bar)])
 
