@@ -27,6 +27,10 @@ _HOMES = {
     "Tied": "mpmopt.design.variables",
     "Displacement": "mpmopt.design.terms",
     "Speed": "mpmopt.design.terms",
+    "Height": "mpmopt.design.places",
+    "PeakHeight": "mpmopt.design.places",
+    "Distance": "mpmopt.design.places",
+    "Driven": "mpmopt.design.driven",
     "Effort": "mpmopt.design.terms",
     "Volume": "mpmopt.design.terms",
     "OnePiece": "mpmopt.design.one_piece",
@@ -43,7 +47,11 @@ _HOMES = {
 if TYPE_CHECKING:
     from mpmopt.app.sweeps import sweep as sweep
     from mpmopt.assess.discretisation import cheapest as cheapest
+    from mpmopt.design.driven import Driven as Driven
     from mpmopt.design.one_piece import OnePiece as OnePiece
+    from mpmopt.design.places import Distance as Distance
+    from mpmopt.design.places import Height as Height
+    from mpmopt.design.places import PeakHeight as PeakHeight
     from mpmopt.design.problem import Problem as Problem
     from mpmopt.design.task import AtMost as AtMost
     from mpmopt.design.task import Task as Task

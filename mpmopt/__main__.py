@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mpmopt import __version__
-from mpmopt.errors import DesignError
+from mpmopt.errors import DesignError, MissingLibraryError
 from mpmopt.io.console import how_to_go_on, reported
 
 if TYPE_CHECKING:
@@ -273,7 +273,7 @@ def resume(path: Path) -> int:
 def export(path: Path, out: Path | None, force: bool, **options: Any) -> int:
     """Write a run's best design as files that other programs read; 1 if one cannot be written."""
     from mpmopt.io.files import refuse_existing
-    from mpmopt.results.export import FILES, size
+    from mpmopt.results.export import FILES, size, widths
     from mpmopt.results.export import export as exported
 
     run = _read(path).run
@@ -288,6 +288,11 @@ def export(path: Path, out: Path | None, force: bool, **options: Any) -> int:
         holes = sum(len(polygon.rings) - 1 for polygon in done.polygons)
         print(f"size    {width:.6g} x {height:.6g} mm, area {area:.6g} mm2")
         print(f"pieces  {len(done.polygons)}, with {holes} holes")
+        try:
+            member, gap = widths(done.polygons, done.detail)
+            print(f"widths  thinnest member {member:.3g} mm, narrowest gap {gap:.3g} mm")
+        except MissingLibraryError as error:
+            print(error)
     if done.loose:
         left = (
             "left out"
@@ -453,7 +458,8 @@ def _parser() -> argparse.ArgumentParser:
         "write its design as drawing, solid and motion",
         "Write the best design without grey: design.svg, design.dxf and design.stl at a size in\n"
         "millimetres, motion.vtkhdf in the scene's units. DXF and STL need pip install\n"
-        "'mpmopt[export]'.",
+        "'mpmopt[export]', and so do\n"
+        "the widths of the thinnest member and gap.",
         "out/walker/run.h5 --svg --dxf --stl --vtk --width 60",
         "out/walker/run.h5 --stl --scale 200 --thickness 8 --drop-components --out parts",
     )
@@ -478,6 +484,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     command.add_argument(
         "--drop-components", action="store_true", help="leave out pieces that hang on nothing"
+    )
+    command.add_argument(
+        "--kerf", type=float, metavar="MM", help="warn of members and gaps thinner than a cut"
     )
     add_place(command, "DIR", "folder (default: the run's)")
     command.set_defaults(do=export)

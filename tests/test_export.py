@@ -33,7 +33,7 @@ from mpmopt.optimisation.history import Candidate, Optimisation
 from mpmopt.optimisation.settings import Settings, Stage
 from mpmopt.results import export as exporting
 from mpmopt.results import runfile
-from mpmopt.results.export import export, in_millimetres, stl
+from mpmopt.results.export import export, in_millimetres, stl, widths
 from mpmopt.results.outline import outline
 from mpmopt.scene import Design, Grid, Mirror, Scene, Solid
 from mpmopt.scene.particles import discretise, mirror_images
@@ -413,6 +413,8 @@ def test_of_a_mirror_scene_all_loose_particles_are_counted(tmp_path):
         (["vtk"], {"width": 60.0}, "ask for svg, dxf or stl too"),
         (["vtk"], {"scale": 80.0}, "neither width nor scale"),
         (["svg", "dxf", "vtk"], {"width": 60.0, "thickness": 3.0}, "ask for stl too"),
+        (["vtk"], {"kerf": 1.0}, "kerf is that of a drawing or a solid"),
+        (["svg"], {"width": 60.0, "kerf": 0.0}, "kerf"),
     ],
 )
 def test_sizes_that_make_no_sense_are_refused_and_nothing_is_written(
@@ -436,6 +438,19 @@ def test_a_missing_extra_says_what_to_install(holed, tmp_path, monkeypatch, name
         export(holed[0], holed[1], tmp_path, ["svg", name], width=60.0)
     assert not list(tmp_path.iterdir())
     export(holed[0], holed[1], tmp_path, ["svg"], width=60.0)
+
+
+def test_a_kerf_wider_than_a_member_or_a_gap_is_warned_of(holed, tmp_path, caplog):
+    problem, x = holed
+    polygons = in_millimetres(outline(problem, x, keep=problem.gamma(x) >= 0.3), width=60.0)
+    member, gap = widths(polygons, 60.0 / 48)
+    assert 0.5 < member < gap < 20.0
+    done = export(problem, x, tmp_path, ["svg"], width=60.0, kerf=0.5 * (gap + member))
+    assert done.detail == pytest.approx(60.0 / 48)
+    (warning,) = caplog.messages
+    assert warning.startswith(
+        f"the thinnest member is {member:.3g} mm wide, less than the kerf of "
+    )
 
 
 def test_a_folder_that_cannot_be_made_is_a_storage_error(holed, tmp_path):
@@ -478,6 +493,7 @@ def test_the_command_writes_all_four_and_says_how_large_it_all_is(holed, tmp_pat
         assert f"{tmp_path / file}  {(tmp_path / file).stat().st_size} bytes" in done.stdout
     assert "60 x 50 mm" in done.stdout
     assert "pieces  1, with 2 holes" in done.stdout
+    assert "widths  thinnest member " in done.stdout
     assert "particles hang on nothing, left out" in done.stdout
     mesh = trimesh.load_mesh(str(tmp_path / "design.stl"))
     assert mesh.bounds[1] == pytest.approx([60.0, 50.0, 6.0], abs=1e-5)

@@ -10,9 +10,11 @@ from mpmopt.assess import refinement, threshold, trajectory
 from mpmopt.assess.discretisation import Discretisation, cheapest, measure
 from mpmopt.assess.trajectory import Motion
 from mpmopt.assess.verify import report
+from mpmopt.design.driven import Driven
+from mpmopt.design.places import Distance, Height, PeakHeight
 from mpmopt.design.problem import Problem
 from mpmopt.design.task import Task
-from mpmopt.design.terms import Displacement
+from mpmopt.design.terms import Displacement, Speed
 
 SCENE = small_scene(steps=16)
 UP = (0.6, 0.8)
@@ -51,6 +53,27 @@ def test_pictures_and_studies_show_it(pair):
     studies = [refinement.study(problem, x) for problem in pair]
     own_rows, same_rows = ([(row.reference, row.distance) for row in rows] for rows in studies)
     assert own_rows == same_rows
+
+
+@pytest.mark.parametrize(
+    "term",
+    [
+        Speed(after=0.008, period=0.016),
+        Height(at=0.03, region=2),
+        PeakHeight(),
+        -1.0 * Distance((0.3, 0.5), at=0.04) - Distance((0.5, 0.5)),
+        Driven(Displacement()),
+    ],
+    ids=str,
+)
+def test_pictures_and_measurements_take_every_term(term):
+    problem = Problem(SCENE, 2.0, task=Task(term))
+    x = smooth(problem)
+    motion = Motion.of(trajectory.optimised(problem, x), [0, 3, 8, 16])
+    assert motion.objective[-1] == problem.value(x)
+    assert np.all(np.isfinite(motion.objective))
+    measured = measure(SCENE, Discretisation.of(SCENE), smooth, 2.0, 1 / 16, task=problem.task)
+    assert np.isfinite(measured.travel)
 
 
 def test_checks_and_measurements_are_of_it(pair):

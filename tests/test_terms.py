@@ -9,9 +9,11 @@ import pytest
 from conftest import small_scene, worst
 
 from mpmopt.assess.verify import complex_step_test, report
+from mpmopt.design.driven import Driven
+from mpmopt.design.places import Distance, Height, PeakHeight
 from mpmopt.design.problem import Problem
 from mpmopt.design.task import DEFAULT_TASK, AtMost, Task
-from mpmopt.design.term import Adjoints, Term
+from mpmopt.design.term import Adjoints, Outcome, Term
 from mpmopt.design.terms import TERMS, Displacement, Effort, OnePiece, Speed, Sum, Volume
 from mpmopt.errors import DesignError
 from mpmopt.scene import Actuator, Design, Grid, Scene, Solid
@@ -30,7 +32,17 @@ def x(rng):
     "term",
     [
         Displacement(direction=(0.6, 0.8)),
+        Displacement(region=2),
         Speed(after=0.02),
+        Speed(after=0.004, direction=(0.0, 1.0), region=1, period=0.02),
+        Height(),
+        Height(at=0.024, region=3),
+        PeakHeight(after=0.008),
+        PeakHeight(region=2),
+        Distance((0.3, 0.5)),
+        Driven(Displacement()),
+        Driven(PeakHeight() - 0.1 * Effort() + Volume()) + 0.5 * Driven(Speed(0.02)),
+        Distance((0.31, 0.42), at=0.02, region=2) + Distance((0.3, 0.5), region=1),
         Effort(),
         Volume(),
         OnePiece(),
@@ -114,6 +126,73 @@ def test_values_are_those_by_hand(x):
     assert whole == pytest.approx(problem.value(x) - 0.5 * value(Effort()), abs=1e-15)
 
 
+def test_what_no_actuator_earns_is_not_driven(x):
+    problem = Problem(SCENE, 2.0, task=Task(Driven(Displacement())))
+    plain, variables = Problem(SCENE, 2.0), problem.split(x)
+    still = problem.join(variables.phi, 0.0, variables.theta, 0.0)
+    assert problem.value(still) == 0.0
+    assert problem.value(x) == pytest.approx(plain.value(x) - plain.value(still), abs=1e-15)
+    assert np.any(plain.evaluate(still).gradient[:32] != 0.0)
+    assert problem.evaluate(still).gradient[:32] == pytest.approx(0.0, abs=1e-15)
+
+
+def test_a_driven_term_is_of_what_is_simulated(x):
+    problem = Problem(SCENE, 2.0, void_cutoff=0.5, task=Task(Driven(Displacement())))
+    there = problem.present(problem.split(x).phi)
+    assert 16 < there.sum() < there.size
+    assert worst(complex_step_test(problem, x)) <= 1e-12
+
+
+def still(term: Term, rows: dict[int, tuple[float, float]]) -> float:
+    """The value of a term of a body that is moved as a whole, by so much at steps."""
+    simulation = Problem(SCENE).simulation(Problem(SCENE).join(0.0, 0.5, 0.0, 0.0))
+    states = {step: simulation.initial.copy() for step in rows}
+    for step, moved in rows.items():
+        states[step][:2] += np.array(moved)[:, None]
+    return term.value(Outcome(simulation, np.zeros(32), states))
+
+
+def test_a_region_is_where_its_rectangle_is():
+    beam, wide = (5 * C, 6.5 * C), (6.5 * C, 6.5 * C)  # centres of regions 2 and 3
+    for region, (x, y) in ((2, beam), (3, wide)):
+        moved = {12: (0.1, 0.2)}
+        assert still(Displacement(region=region), moved) == pytest.approx(x + 0.1)
+        assert still(Height(region=region), moved) == pytest.approx(y + 0.2)
+        near = Distance((x + 0.1 - 0.3, y + 0.2 - 0.4), region=region)
+        assert still(near, moved) == pytest.approx(0.5, abs=1e-3)
+        there = Distance((x + 0.1, y + 0.2), region=region)
+        assert still(there, moved) == pytest.approx(0.0, abs=1e-12)
+    assert still(Height(at=0.02), {5: (0.0, 0.1), 12: (0.0, 9.0)}) == pytest.approx(6.5 * C + 0.1)
+
+
+def test_a_peak_is_the_highest_instant_and_not_more():
+    height = 3 * C
+    soft = 0.01 * height
+    level = {step: (0.0, 0.25) for step in range(13)}
+    assert still(PeakHeight(), level) == pytest.approx(6.5 * C + 0.25, abs=1e-14)
+    bump = {**level, 7: (0.0, 0.75)}
+    peak = still(PeakHeight(), bump)
+    assert peak == pytest.approx(6.5 * C + 0.75 - soft * math.log(13), abs=1e-12)
+    assert still(PeakHeight(after=0.03), bump) == pytest.approx(6.5 * C + 0.25, abs=1e-14)
+
+
+def test_means_over_a_period_leave_no_trace_of_an_oscillation():
+    scene = small_scene(steps=100, time_step=2e-3)
+    simulation = Problem(scene).simulation(Problem(scene).join(0.0, 0.5, 0.0, 0.0))
+    term = Speed(after=0.02, period=0.064)
+    states = {step: simulation.initial.copy() for step in {*term.instants(scene), 100}}
+    for step, state in states.items():
+        t = 2e-3 * step
+        state[0] += (
+            0.3 * t
+            + 0.1 * np.sin(2 * np.pi * t / 0.064 + 0.7)
+            + 0.05 * np.cos(6 * np.pi * t / 0.064)
+        )
+    outcome = Outcome(simulation, np.zeros(32), states)
+    assert term.value(outcome) == pytest.approx(0.3, rel=1e-12)
+    assert abs(Speed(after=0.02).value(outcome) - 0.3) > 0.1
+
+
 def beam(*regions) -> Scene:
     """A row of cells that are designed under a beam, of one particle each."""
     return Scene(Grid((16, 16), C), 4e-3, 4, regions, particles_per_cell=1)
@@ -183,6 +262,8 @@ def test_a_design_that_can_hang_on_nothing_is_named(regions, says):
 
 def test_every_term_comes_back_from_json():
     made = {Displacement: Displacement((0.6, 0.8)), Speed: Speed(0.5, (0.0, -1.0))}
+    made[Distance] = Distance((0.5, 0.25), at=0.5, region=2)
+    made[Driven] = Driven(Speed(0.25))
     made[Sum] = Sum(((1.0, Speed(0.25)), (-0.5, Sum(((2.0, Effort()),)))))
     for kind in TERMS:
         term = made.get(kind) or kind()
@@ -192,7 +273,7 @@ def test_every_term_comes_back_from_json():
 
 
 @dataclass(frozen=True)
-class Height(Term):
+class Corner(Term):
     """How high the first particle ends: a term of one's own."""
 
     def value(self, outcome):
@@ -205,9 +286,9 @@ class Height(Term):
 
 
 def test_an_own_term_needs_two_methods(x):
-    problem = Problem(SCENE, 2.0, task=Task(Displacement(), (AtMost(Height(), 0.3),)))
+    problem = Problem(SCENE, 2.0, task=Task(Displacement(), (AtMost(Corner(), 0.3),)))
     assert worst(complex_step_test(problem, x, directions=1)) <= 1e-12
-    with pytest.raises(DesignError, match=r"Height is not known to run files: .*terms\.py"):
+    with pytest.raises(DesignError, match=r"Corner is not known to run files: .*terms\.py"):
         problem.task.to_json()
 
 
@@ -221,6 +302,19 @@ def test_an_own_term_needs_two_methods(x):
         (lambda: AtMost(Volume(), np.nan), "bound = nan must be finite"),
         (lambda: Displacement((1.0, 1.0)), r"has length 1.41421, must have 1"),
         (lambda: Speed(after=-1.0), "after = -1 must not be negative"),
+        (lambda: Speed(period=-1.0), "period = -1 must not be negative"),
+        (lambda: Driven(0.4), "term = 0.4 .* class Term; such as"),
+        (lambda: Height(at=-1.0), "Height: at = -1 must not be negative"),
+        (lambda: Height(region=-1), "region = -1 must"),
+        (lambda: Displacement(region=1.5), "region = 1.5 must be a whole number"),
+        (lambda: Distance(0.5), "target = 0.5"),
+        (lambda: Problem(SCENE, task=Task(Height(region=4))), "region = 4 must .* from 0 to 3"),
+        (lambda: Problem(SCENE, task=Task(Speed(region=0))), "region 0 is a Design .* name a S"),
+        (lambda: Problem(SCENE, task=Task(Distance((0, 0), at=1.0))), "at = 1 is after .* 0.048"),
+        (
+            lambda: Problem(SCENE, task=Task(Speed(0.012, period=0.02))),
+            "after = 0.012 and two periods of 0.02 takes all",
+        ),
         (lambda: Speed(after="late"), "after = 'late' must be a number"),
         (lambda: Sum(()), r"terms = \(\) must be pairs"),
         (lambda: Sum(((1.0, 2.0),)), "must be pairs"),
@@ -244,7 +338,13 @@ def test_json_holds_numbers_and_names_only():
     task = Task(Speed(0.5), (AtMost(Volume(), 0.4),))
     assert json.loads(task.to_json()) == {
         "kind": "Task",
-        "maximise": {"kind": "Speed", "after": 0.5, "direction": None},
+        "maximise": {
+            "kind": "Speed",
+            "after": 0.5,
+            "direction": None,
+            "region": None,
+            "period": 0.0,
+        },
         "subject_to": [{"kind": "AtMost", "term": {"kind": "Volume"}, "bound": 0.4}],
         "scenes": [],
         "soft_minimum": 0.0,

@@ -354,6 +354,9 @@ class Problem:
             present = self.present(phi)
             density_bar[present], stiffness_bar[present] = sweep.density, sweep.stiffness
             signal_bar = sweep.signal + bars.signal
+        if np.ndim(bars.density):  # of a term that simulates by itself
+            density_bar[self.present(phi)] += bars.density
+            stiffness_bar[self.present(phi)] += bars.stiffness
         phi_bar = self.chain.field(phi).pullback(density_bar, stiffness_bar, bars.gamma)
         actuation_bar = signal_adjoint(self.scene, a, theta, signal_bar, omega)
         return np.concatenate([phi_bar, *actuation_bar])

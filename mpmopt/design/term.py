@@ -50,11 +50,15 @@ class Adjoints:
         Where the adjoint sweep begins; without any there is no sweep.
     signal : (steps, K) array or 0.0
     gamma : (D,) array or 0.0
+    density, stiffness : (N,) arrays or 0.0
+        Of the particles that were simulated: of a term that simulates by itself.
     """
 
     states: dict[int, NDArray[np.float64]] = field(default_factory=dict)
     signal: NDArray[np.float64] | float = 0.0
     gamma: NDArray[np.float64] | float = 0.0
+    density: NDArray[np.float64] | float = 0.0
+    stiffness: NDArray[np.float64] | float = 0.0
 
 
 class Term:
@@ -120,11 +124,11 @@ class Sum(Term, Checked):
 
     def adjoints(self, outcome: Outcome) -> Adjoints:
         states: dict[int, NDArray[np.float64]] = {}
-        signal: Any = 0.0
-        gamma: Any = 0.0
+        others = dict.fromkeys(("signal", "gamma", "density", "stiffness"), 0.0)
         for weight, term in self.terms:
             bars = term.adjoints(outcome)
             for step, bar in bars.states.items():
                 states[step] = weight * bar + states.get(step, 0.0)
-            signal, gamma = signal + weight * bars.signal, gamma + weight * bars.gamma
-        return Adjoints(states, signal, gamma)
+            for name in others:
+                others[name] = others[name] + weight * getattr(bars, name)
+        return Adjoints(states, **others)

@@ -7,18 +7,18 @@ from typing import Any
 
 import numpy as np
 
-from mpmopt.design.objective import Objective
+from mpmopt.design.driven import Driven
+from mpmopt.design.objective import check_region
 from mpmopt.design.one_piece import OnePiece
+from mpmopt.design.places import Distance, Height, PeakHeight, centroid_of, region_number
 from mpmopt.design.term import Adjoints, Outcome, Sum, Term
 from mpmopt.errors import DesignError
 from mpmopt.scene import Scene
 from mpmopt.scene.parts import Checked, Vector, vector
 from mpmopt.validation import number
 
-
-def _centroid(outcome: Outcome, direction: Vector | None) -> Objective:
-    simulation = outcome.simulation
-    return Objective.of(simulation.scene, simulation.particles, direction)
+# A mean over a period is over so many instants: exact for all harmonics below this one.
+LOOKS = 16
 
 
 def _unit(owner: str, direction: Vector | None) -> Vector | None:
@@ -38,21 +38,29 @@ class Displacement(Term, Checked):
     ----------
     direction : (float, float), optional
         Unit vector; default: the scene's. What comes before the scene's transient does not count.
+    region : int, optional
+        Number in the scene's body of the one region whose centroid it is, no `Design`.
     """
 
     direction: Vector | None = None
+    region: int | None = None
 
     def __post_init__(self) -> None:
-        self._set(direction=_unit("Displacement", self.direction))
+        self._set(
+            direction=_unit("Displacement", self.direction),
+            region=region_number("Displacement", self.region),
+        )
 
     def instants(self, scene: Scene) -> tuple[int, ...]:
+        check_region("Displacement", scene, self.region)
         return (scene.transient_steps,) if scene.transient_steps else ()
 
     def value(self, outcome: Outcome) -> Any:
-        return _centroid(outcome, self.direction).value(outcome.states)
+        return centroid_of(outcome, self.direction, self.region).value(outcome.states)
 
     def adjoints(self, outcome: Outcome) -> Adjoints:
-        return Adjoints(_centroid(outcome, self.direction).terminal_adjoints(outcome.states))
+        objective = centroid_of(outcome, self.direction, self.region)
+        return Adjoints(objective.terminal_adjoints(outcome.states))
 
 
 @dataclass(frozen=True)
@@ -63,44 +71,74 @@ class Speed(Term, Checked):
     ----------
     after : float
         Time from which it counts; rounded to a whole step.
-    direction : (float, float), optional
+    direction, region : optional
         As in `Displacement`.
+    period : float, optional
+        Instead of c(after) and c(T) take the means over the period after the one and before the
+        other, so that it does not matter at which phase of its gait a body ends; the time between
+        is then T - period - after. Zero: no means.
     """
 
     after: float = 0.0
     direction: Vector | None = None
+    region: int | None = None
+    period: float = 0.0
 
     def __post_init__(self) -> None:
-        after = number("Speed", "after", self.after, error=DesignError)
-        if after < 0.0:
-            raise DesignError(f"Speed: after = {after:g} must not be negative")
-        self._set(after=after, direction=_unit("Speed", self.direction))
+        for name in ("after", "period"):
+            value = number("Speed", name, getattr(self, name), error=DesignError)
+            if value < 0.0:
+                raise DesignError(f"Speed: {name} = {value:g} must not be negative")
+            self._set(**{name: value})
+        self._set(
+            direction=_unit("Speed", self.direction), region=region_number("Speed", self.region)
+        )
+
+    def _steps(self, scene: Scene) -> tuple[list[int], list[int]]:
+        """Where the motion that counts begins, and where it ends if that is not the end."""
+        begin, period = (
+            round(min(time / scene.time_step, scene.steps)) for time in (self.after, self.period)
+        )
+        if begin + max(2 * period, 1) > scene.steps:
+            periods = f" and two periods of {self.period:g}" if period else ""
+            raise DesignError(
+                f"Speed: after = {self.after:g}{periods} takes all of the scene's "
+                f"{scene.duration:g}; take less, or more steps"
+            )
+        if not period:
+            return [begin], []
+        looks = [k * period // LOOKS for k in range(LOOKS)]
+        return [begin + k for k in looks], [scene.steps - period + k for k in looks]
 
     def instants(self, scene: Scene) -> tuple[int, ...]:
-        first = round(min(self.after / scene.time_step, scene.steps))
-        if first == scene.steps:
-            raise DesignError(
-                f"Speed: after = {self.after:g} takes all of the scene's {scene.duration:g}; take "
-                "less, or more steps"
-            )
-        return (first,)
+        check_region("Speed", scene, self.region)
+        first, last = self._steps(scene)
+        return tuple(sorted({*first, *last}))
 
-    def _between(self, outcome: Outcome) -> tuple[int, float]:
-        """The first step, and the time from there to the end."""
+    def _between(self, outcome: Outcome) -> tuple[list[int], list[int], float]:
+        """Where it begins and ends, and the time from there to there."""
         scene = outcome.simulation.scene
-        (first,) = self.instants(scene)
-        return first, max(outcome.end - first, 1) * scene.time_step  # at the first: no speed yet
+        first, last = self._steps(scene)
+        last = last or [outcome.end]
+        return first, last, max(last[0] - first[0], 1) * scene.time_step  # at the first: 0
 
     def value(self, outcome: Outcome) -> Any:
-        centroid = _centroid(outcome, self.direction).centroid
-        first, time = self._between(outcome)
-        return (centroid(outcome.states[outcome.end]) - centroid(outcome.states[first])) / time
+        centroid = centroid_of(outcome, self.direction, self.region).centroid
+        first, last, time = self._between(outcome)
+        begin, end = (
+            sum(centroid(outcome.states[step]) for step in steps) / len(steps)
+            for steps in (first, last)
+        )
+        return (end - begin) / time
 
     def adjoints(self, outcome: Outcome) -> Adjoints:
-        adjoint = _centroid(outcome, self.direction).centroid_adjoint
-        first, time = self._between(outcome)
-        end, states = outcome.end, outcome.states
-        return Adjoints({first: -adjoint(states[first]) / time, end: adjoint(states[end]) / time})
+        adjoint = centroid_of(outcome, self.direction, self.region).centroid_adjoint
+        first, last, time = self._between(outcome)
+        weights = dict.fromkeys((*first, *last), 0.0)
+        for steps, sign in ((first, -1.0), (last, 1.0)):
+            for step in steps:
+                weights[step] += sign / (time * len(steps))
+        return Adjoints({step: w * adjoint(outcome.states[step]) for step, w in weights.items()})
 
 
 @dataclass(frozen=True)
@@ -128,4 +166,15 @@ class Volume(Term):
 
 
 # What a run file can name.
-TERMS: tuple[type[Term], ...] = (Displacement, Speed, Effort, Volume, OnePiece, Sum)
+TERMS: tuple[type[Term], ...] = (
+    Displacement,
+    Speed,
+    Height,
+    PeakHeight,
+    Distance,
+    Driven,
+    Effort,
+    Volume,
+    OnePiece,
+    Sum,
+)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from mpmopt.assess.threshold import THRESHOLD, kept, pieces
 from mpmopt.assess.trajectory import Motion, equal_steps, solid
+from mpmopt.assess.width import thinnest_gap, thinnest_member
 from mpmopt.design.problem import Problem
 from mpmopt.errors import ExportError, MissingLibraryError, MpmoptError, StorageError
 from mpmopt.io.files import make_folder, replace_file
@@ -45,12 +46,27 @@ class Exported:
         Particles of the whole body that hang on nothing (`threshold.pieces`).
     failed : tuple of str
         Formats that could not be written; a warning says why.
+    detail : float
+        Spacing of particles in millimetres: nothing finer is known of the outline.
     """
 
     paths: tuple[Path, ...]
     polygons: list[Polygon]
     loose: int
     failed: tuple[str, ...] = ()
+    detail: float = 0.0
+
+
+def widths(polygons: Sequence[Polygon], detail: float = 0.0) -> tuple[float, float]:
+    """Width of the thinnest member and of the narrowest gap (`width.thinnest_member`).
+
+    Raises
+    ------
+    MissingLibraryError
+        If manifold3d is not installed.
+    """
+    rings = [ring for polygon in polygons for ring in polygon.rings]
+    return thinnest_member(rings, detail), thinnest_gap(rings, detail)
 
 
 def export(
@@ -64,6 +80,7 @@ def export(
     thickness: float | None = None,
     threshold: float = THRESHOLD,
     drop_components: bool = False,
+    kerf: float | None = None,
 ) -> Exported:
     """Write a design without grey, as drawing, solid and motion, into a folder.
 
@@ -87,6 +104,9 @@ def export(
     threshold : float, optional
     drop_components : bool, optional
         Leave out pieces that hang on nothing (`threshold.pieces`), in drawings, solid and motion.
+    kerf : float, optional
+        Width of the cut or of the nozzle, in millimetres: a warning tells of a member or a gap that
+        is thinner.
 
     Raises
     ------
@@ -94,7 +114,8 @@ def export(
         If nothing is asked for, or a size is missing, makes no sense or has no effect; nothing is
         written then.
     MissingLibraryError
-        If ezdxf or manifold3d is needed and not installed; nothing is written then.
+        If ezdxf or manifold3d (for stl and a kerf) is needed and not installed; nothing is written
+        then.
     DesignError
         If x or the threshold does not fit.
     SimulationError
@@ -115,14 +136,24 @@ def export(
             "the motion is in the scene's units: ask for svg, dxf or stl too, or give neither "
             "width nor scale"
         )
+    if kerf is not None:
+        number("export", "kerf", kerf, above=0.0, error=ExportError)
+        if not drawn:
+            raise ExportError("a kerf is that of a drawing or a solid: ask for one, or give none")
     keep = kept(problem, x, threshold)
     loose = pieces(problem.scene, keep) > 0
     if drop_components:
         keep &= ~loose
     polygons: list[Polygon] = []
+    detail = 0.0
     writers: dict[str, Callable[[], bytes]] = {}
     if drawn:
-        polygons = in_millimetres(outline(problem, x, threshold, keep), width, scale)
+        plain = outline(problem, x, threshold, keep)
+        polygons = in_millimetres(plain, width, scale)
+        spacing = problem.scene.grid.dx / problem.scene.particles_per_cell
+        detail = spacing * size(polygons)[0] / size(plain)[0]
+        if kerf is not None:
+            _warn_of_thin(polygons, detail, kerf)
         if thickness is None:
             thickness = 0.1 * size(polygons)[0]
         if "stl" in formats:
@@ -161,7 +192,19 @@ def export(
     for name, reason in failed.items():
         logger.warning("no %s: %s", FILES[name], reason)
     halves = 1 if problem.scene.mirror is None else 2
-    return Exported(tuple(paths), polygons, halves * int(loose.sum()), tuple(failed))
+    return Exported(tuple(paths), polygons, halves * int(loose.sum()), tuple(failed), detail)
+
+
+def _warn_of_thin(polygons: Sequence[Polygon], detail: float, kerf: float) -> None:
+    for what, thinnest in zip(("member", "gap"), widths(polygons, detail), strict=True):
+        if thinnest < kerf:
+            logger.warning(
+                "the thinnest %s is %.3g mm wide, less than the kerf of %.3g mm: draw it larger, "
+                "or optimise with a longer filter_length",
+                what,
+                thinnest,
+                kerf,
+            )
 
 
 def size(polygons: Sequence[Polygon]) -> NDArray[np.float64]:
