@@ -2,6 +2,7 @@
 
 examples:
   python cases/walker.py --preview --out out/walker    make a run
+  mpmopt report out/walker/run.h5                      one page of all that it found
   mpmopt plot out/walker/run.h5                        pictures of it
   mpmopt film out/walker/run.h5                        and a film
   mpmopt verify out/walker/run.h5                      are its gradients right?
@@ -54,6 +55,20 @@ def plot(path: Path, out: Path | None, force: bool) -> int:
             progress.print(str(picture))
 
         plot_run(folder, run, written)
+    return 0
+
+
+def report(path: Path, out: Path | None, force: bool) -> int:
+    """Write a run's report: one HTML file with film, gait, history, designs and numbers."""
+    from mpmopt.io.files import make_folder, refuse_existing
+    from mpmopt.view.report import report as reported_on
+
+    found = _read(path)
+    target = out or path.parent / "report.html"
+    refuse_existing([target] if out else (), force)
+    make_folder(target.parent)
+    reported_on(target, found.run, found.summary, found.versions, path)
+    print(f"{target}: {target.stat().st_size / 1e6:.2g} MB")
     return 0
 
 
@@ -313,6 +328,18 @@ def _parser() -> argparse.ArgumentParser:
         "out/walker/run.h5",
     )
     command.set_defaults(do=resume, advice=how_to_go_on)
+
+    command = add(
+        "report",
+        "write a page of its film, gait, history, designs and numbers",
+        "Write report.html, a single file that any browser opens without a network: the best\n"
+        "design in motion, its gait, the history, the designs, its robustness, the constraints,\n"
+        "all settings, and how to reproduce it.",
+        "out/walker/run.h5",
+        "out/walker/run.h5 --out walker.html",
+    )
+    add_place(command, "FILE", "HTML file (default: report.html there)")
+    command.set_defaults(do=report)
 
     command = add(
         "plot",

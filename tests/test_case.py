@@ -102,7 +102,7 @@ def test_a_small_climber_climbs_even_without_its_void(tmp_path):
 def test_the_folder_holds_run_summary_and_pictures(folder):
     out, summary = folder
     names = {path.name for path in out.iterdir()}
-    assert names == {"run.h5", "summary.json", "design.png", "history.png"}
+    assert names == {"run.h5", "summary.json", "design.png", "history.png", "report.html"}
     assert json.loads((out / "summary.json").read_text()) == summary
     assert set(summary) >= {
         "start", "reference", "baseline", "optimised", "post_processed", "a", "theta", "b",
@@ -194,7 +194,7 @@ def test_a_linked_run_is_written_where_the_link_leads(tmp_path):
     (there / "design.png").unlink()
     assert run(TINY, here) == resume(here / "run.h5")
     assert [path.name for path in here.iterdir()] == ["run.h5"]
-    assert len(list(there.iterdir())) == 4
+    assert len(list(there.iterdir())) == 5
     assert (here / "run.h5").is_symlink()
 
 

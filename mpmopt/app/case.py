@@ -34,7 +34,8 @@ logger = logging.getLogger(__name__)
 
 # Besides run.h5; the last three of robots on ground.
 RESULTS = (
-    "summary.json", "design.png", "history.png", "stride.png", "gait.png", "robustness.png",
+    "summary.json", "report.html", "design.png", "history.png",
+    "stride.png", "gait.png", "robustness.png",
 )  # fmt: skip
 START = {"phi": 0.0, "a": 1.0, "theta": -0.3, "b": -0.5}
 
@@ -114,8 +115,8 @@ def run(
     """Optimise a case and leave its results in a folder.
 
     Writes ``run.h5`` (before the first and after every evaluation), ``summary.json``,
-    ``design.png`` and ``history.png``; of a robot on ground also ``stride.png``, ``gait.png`` and
-    ``robustness.png``. A folder that holds an unfinished run of this case is gone
+    ``report.html``, ``design.png`` and ``history.png``; of a robot on ground also ``stride.png``,
+    ``gait.png`` and ``robustness.png``. A folder that holds an unfinished run of this case is gone
     on with; one that holds a finished one is left as it is.
 
     Parameters
@@ -251,20 +252,23 @@ def _go_on(
     text = json.dumps(summary, indent=1) + "\n"
     replace_file(path.parent / "summary.json", text.encode())
     runfile.write(path, result, summary, kept.baseline)
-    drawn = RESULTS[1:] if "speed" in summary else RESULTS[1:3]
+    drawn = RESULTS[1:] if "speed" in summary else RESULTS[1:4]
     for name in drawn:
-        draw_or_warn(path.parent / name, lambda picture: _draw(picture, result, summary))
+        draw_or_warn(path.parent / name, lambda target: _draw(target, result, summary, path))
     return summary
 
 
-def _draw(path: Path, result: Optimisation, summary: Mapping[str, Any]) -> None:
+def _draw(target: Path, result: Optimisation, summary: Mapping[str, Any], source: Path) -> None:
     from mpmopt.view.gait import plot_robustness
     from mpmopt.view.plot import PICTURES
+    from mpmopt.view.report import report
 
-    if path.name == "robustness.png":
-        plot_robustness(path, summary)
+    if target.suffix == ".html":
+        report(target, result, summary, runfile.versions(), source)
+    elif target.name == "robustness.png":
+        plot_robustness(target, summary)
     else:
-        PICTURES[path.stem](path, result)
+        PICTURES[target.stem](target, result)
 
 
 def draw_or_warn(path: Path, draw: Callable[[Path], None]) -> None:
