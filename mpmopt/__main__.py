@@ -252,11 +252,12 @@ def cheapest(path: Path, tol: float, gradient_tol: float | None, seconds: float)
 
 
 def resume(path: Path) -> int:
-    """Go on with a run that was stopped, and print its summary."""
+    """Go on with a run that was stopped, and print what it found."""
     from mpmopt.app.case import resume as resumed
-    from mpmopt.app.summary import table
+    from mpmopt.app.ending import ending
 
-    print(table(resumed(path)))
+    resumed(path)
+    print(ending(path))
     return 0
 
 

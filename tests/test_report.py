@@ -22,7 +22,7 @@ from mpmopt.scene import Ground
 from mpmopt.scene.particles import discretise
 from mpmopt.view import report as reporting
 from mpmopt.view.draw import view
-from mpmopt.view.report import chosen, design_picture, feet, origin, packed, report
+from mpmopt.view.report import design_picture, feet, packed, report
 
 SUMMARY = {
     "start": 0.32, "reference": 0.31, "optimised": 0.5, "post_processed": 0.4,
@@ -66,7 +66,7 @@ def test_the_page_holds_everything_itself_and_nothing_of_the_data_ends_its_scrip
 def test_displacements_count_from_where_the_body_was(page, short_run):
     data = data_of(page)
     start = 5 / 16  # the middle of solid and actuators
-    assert origin(short_run) == pytest.approx(start)
+    assert short_run.origin == pytest.approx(start)
     assert data["tables"]["travel"]["without grey"] == pytest.approx(0.4 - start)
     wanted = [item.objective - start for item in short_run.history]
     assert data["history"]["objective"] == pytest.approx(wanted, rel=1e-4)
@@ -74,10 +74,10 @@ def test_displacements_count_from_where_the_body_was(page, short_run):
 
 
 def test_the_chosen_evaluation_is_the_results(page, short_run):
-    number = chosen(short_run, short_run.result)
+    number = short_run.chosen
     assert data_of(page)["history"]["chosen"] == number
     assert short_run.history[number - 1].objective == short_run.result.objective
-    assert number == 2 and chosen(short_run, short_run.first) == 1
+    assert number == 2 and short_run.number_of(short_run.first) == 1
 
 
 def unpacked(text, frames, particles):

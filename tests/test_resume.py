@@ -101,7 +101,10 @@ def test_a_signal_ends_a_run_with_its_code_and_says_how_to_go_on(whole, tmp_path
     assert process.wait_for("reverse")
     found, text = process.end(number)
     assert found == code
-    assert f"{number.name}. Every evaluation is saved; go on with: {sys.executable} -m mpmopt resume" in text
+    assert (
+        f"{number.name}. Every evaluation is saved; go on with: {sys.executable} -m mpmopt resume"
+        in text
+    )
     assert "Traceback" not in text
     assert faults.resumed(tmp_path / "out") == whole
 

@@ -90,18 +90,30 @@ class ProgressBar:
     """Callback of `optimise` that shows how far it is; log lines off a terminal."""
 
     def __init__(self) -> None:
-        self._progress = Progress("gradients")
+        self._progress = Progress("evaluations")
+        self._origin: float | None = None
 
     def __call__(self, run: Optimisation) -> None:
-        self._progress.count = len(run.history) - 1
         if run.stop_reason:
             self._progress.close()
             return
+        if self._origin is None:
+            self._origin = run.origin
         last = run.history[-1]
+        self._progress.count = len(run.history) - 1
+        self._progress.total = most_evaluations(run)
         self._progress.step(
-            f"L {digits(last.objective)}, beta {last.beta:g}, "
-            f"non-discreteness {last.non_discreteness:.3f}"
+            f"{run.measure} {digits(last.objective - self._origin, 3)}, beta {last.beta:g}, "
+            f"non-discreteness {last.non_discreteness:.2f}"
         )
+
+
+def most_evaluations(run: Optimisation) -> int:
+    """How many evaluations a run will have had if no stage ends early from now on."""
+    settings, now = run.settings, run.stage
+    limits = [stage.most_iterations or settings.most_iterations for stage in settings.stages]
+    done = sum(item.stage == now and not item.failure for item in run.history)
+    return len(run.history) + max(limits[now] - done, 0) + sum(limits[now + 1 :])
 
 
 def run(

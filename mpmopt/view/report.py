@@ -26,12 +26,10 @@ from PIL import Image
 from scipy.ndimage import label
 
 from mpmopt.assess.trajectory import Body, Motion, equal_steps, optimised, post_processed, reference
-from mpmopt.design.objective import Objective
-from mpmopt.design.terms import Displacement
 from mpmopt.errors import SimulationError
 from mpmopt.io.console import command
 from mpmopt.io.files import replace_file
-from mpmopt.optimisation.history import Candidate, Optimisation
+from mpmopt.optimisation.history import Optimisation
 from mpmopt.scene import Scene
 from mpmopt.scene.particles import discretise, mirror_images
 from mpmopt.view.draw import FAINTEST, RED, ground_outline, view
@@ -123,18 +121,6 @@ def report(
     data = json.dumps(_finite(content), separators=(",", ":")).replace("<", "\\u003c")
     page = page.replace("$NAME", html.escape(name)).replace("$DATA", data)
     replace_file(path, page.encode("utf-8", errors="backslashreplace"))
-
-
-def origin(run: Optimisation) -> float:
-    """What a body that stays put has as objective: displacements count from there."""
-    if not isinstance(run.task.maximise, Displacement):
-        return 0.0
-    return Objective.of(run.scene, discretise(run.scene), run.task.maximise.direction).start
-
-
-def chosen(run: Optimisation, item: Candidate) -> int:
-    """Number of the evaluation, from 1, that a design is of."""
-    return 1 + next(k for k, each in enumerate(run.history) if each.seconds == item.seconds)
 
 
 def _finite(value: Any) -> Any:
@@ -282,13 +268,11 @@ def _history(run: Optimisation) -> dict[str, Any]:
         "stage", "beta", "objective", "post_processed", "refined", "non_discreteness", "violation",
         "halved", "seconds", "failure",
     )  # fmt: skip
-    zero = origin(run)
+    zero = run.origin
     columns: dict[str, Any] = {name: [getattr(i, name) for i in run.history] for name in names}
     for name in ("objective", "post_processed", "refined"):
         columns[name] = [value - zero for value in columns[name]]
-    displacement = isinstance(run.task.maximise, Displacement)
-    columns["unit"] = "displacement" if displacement else f"objective, {run.task.maximise}"
-    columns["chosen"] = chosen(run, run.result)
+    columns["unit"], columns["chosen"] = run.measure, run.chosen
     return columns
 
 
@@ -300,7 +284,7 @@ def _designs(run: Optimisation) -> list[dict[str, Any]]:
     for name, item in named:
         if item is None:
             continue
-        number = chosen(run, item)
+        number = run.number_of(item)
         if number in numbered:
             numbered[number]["names"].append(name)
             continue
@@ -343,7 +327,7 @@ PLACED = {
 def _tables(
     run: Optimisation, summary: Mapping[str, Any], versions: Mapping[str, str]
 ) -> dict[str, Any]:
-    zero, rest = origin(run), dict(summary)
+    zero, rest = run.origin, dict(summary)
     result = run.result
     travel = {
         text: None if rest[name] is None else rest[name] - zero
