@@ -264,12 +264,13 @@ def resume(path: Path) -> int:
 def export(path: Path, out: Path | None, force: bool, **options: Any) -> int:
     """Write a run's best design as files that other programs read; 1 if one cannot be written."""
     from mpmopt.io.files import refuse_existing
-    from mpmopt.results.export import FILES, size
     from mpmopt.results.export import export as exported
+    from mpmopt.results.export import files, ours, size
 
     run = _read(path).run
     folder = out or path.parent
-    refuse_existing((folder / FILES[name] for name in options["formats"] if out), force)
+    there = [folder / name for name in files(options["formats"], options["parts"])]
+    refuse_existing((file for file in there if out and not ours(file)), force)
     done = exported(run.problem(), run.result.x, folder, **options)
     for file in done.paths:
         print(f"{file}  {file.stat().st_size} bytes")
@@ -437,21 +438,28 @@ def _parser() -> argparse.ArgumentParser:
     command = add(
         "export",
         "write its design as drawing, solid and motion",
-        "Write the best design without grey: design.svg, design.dxf and design.stl at a size in\n"
-        "millimetres, motion.vtkhdf in the scene's units. DXF and STL need pip install\n"
-        "'mpmopt[export]'.",
+        "Write the best design without grey: design.svg, design.dxf, design.stl and design.3mf at\n"
+        "a size in millimetres, motion.vtkhdf in the scene's units. All but SVG and the motion\n"
+        "need pip install 'mpmopt[export]'.",
         "out/walker/run.h5 --svg --dxf --stl --vtk --width 60",
         "out/walker/run.h5 --stl --scale 200 --thickness 8 --drop-components --out parts",
+        "out/walker/run.h5 --stl --svg --parts --width 60 --out molds",
     )
     for name, text in (
         ("svg", "write a drawing"),
         ("dxf", "write a drawing for CAD"),
         ("stl", "write a watertight solid"),
+        ("3mf", "write the same for printers that know several materials"),
         ("vtk", "write the motion, for ParaView"),
     ):
         command.add_argument(
             f"--{name}", dest="formats", action="append_const", const=name, default=[], help=text
         )
+    command.add_argument(
+        "--parts",
+        action="store_true",
+        help="actuators and passive body apart: layers, objects, a file of each as STL",
+    )
     command.add_argument("--width", type=float, metavar="MM", help="width of the drawing or solid")
     command.add_argument(
         "--scale", type=float, metavar="MM", help="instead: length of the scene's unit"
