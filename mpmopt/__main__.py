@@ -216,6 +216,22 @@ def forces(path: Path, out: Path | None, force: bool) -> int:
     return 0
 
 
+def trajectory(path: Path, out: Path | None, force: bool) -> int:
+    """Write how a run's best design moves, without grey, as comma-separated values."""
+    from mpmopt.assess.trajectory import post_processed
+    from mpmopt.io.files import make_folder, refuse_existing, replace_file
+    from mpmopt.results.trajectory import table
+
+    run = _read(path).run
+    target = out or path.parent / "trajectory.csv"
+    refuse_existing([target] if out else (), force)
+    text = table(post_processed(run.problem(), run.result.x))
+    make_folder(target.parent)
+    replace_file(target, text.encode())
+    print(f"{target}: {len(text.splitlines()) - 1} instants")
+    return 0
+
+
 def cheapest(path: Path, tol: float, gradient_tol: float | None, seconds: float) -> int:
     """Print the cheapest discretisation that tells a run's best design as well as the finest."""
     from mpmopt.assess import discretisation
@@ -417,6 +433,18 @@ def _parser() -> argparse.ArgumentParser:
     )
     add_place(command, "DIR", "folder (default: the run's)")
     command.set_defaults(do=forces)
+
+    command = add(
+        "trajectory",
+        "write how its best design moves as a table",
+        "Write trajectory.csv, of the best design without void, in the scene's units: time, place\n"
+        "and velocity of the centroid, travel, the actuators' signals, and for each foot its\n"
+        "height and whether it touches.",
+        "out/walker/run.h5",
+        "out/walker/run.h5 --out walker.csv",
+    )
+    add_place(command, "FILE", "CSV file (default: trajectory.csv there)")
+    command.set_defaults(do=trajectory)
 
     command = add(
         "cheapest",

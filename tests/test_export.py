@@ -362,7 +362,7 @@ def objects_of(path):
     assert model.attrib["unit"] == "millimeter"
     items = [item.attrib["objectid"] for item in model.iterfind("m:build/m:item", space)]
     colours = model.findall("m:resources/m:basematerials/m:base", space)
-    found = {}
+    found: dict[str, Any] = {}
     for each in model.iterfind("m:resources/m:object", space):
         assert each.attrib["id"] == items[len(found)]
         assert colours[int(each.attrib["pindex"])].attrib["name"] == each.attrib["name"]

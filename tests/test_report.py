@@ -1,7 +1,6 @@
 """The report of a run: its numbers, and its page in a real browser."""
 
 import base64
-import dataclasses
 import json
 import zlib
 from io import BytesIO
@@ -18,11 +17,10 @@ from mpmopt.assess.trajectory import Motion, optimised, post_processed
 from mpmopt.design.problem import Problem
 from mpmopt.errors import DesignError, SimulationError
 from mpmopt.results import runfile
-from mpmopt.scene import Ground
 from mpmopt.scene.particles import discretise
 from mpmopt.view import report as reporting
 from mpmopt.view.draw import view
-from mpmopt.view.report import design_picture, feet, packed, report
+from mpmopt.view.report import design_picture, packed, report
 
 SUMMARY = {
     "start": 0.32, "reference": 0.31, "optimised": 0.5, "post_processed": 0.4,
@@ -113,42 +111,6 @@ def test_films_show_what_moves_and_end_where_it_ends(page, short_run):
     motion = Motion.of(body, [0, scene.steps])
     moved = np.diff(motion.position.mean(axis=2), axis=0)[0] @ scene.direction
     assert films["post-processed design"]["travel"][-1] == pytest.approx(moved, rel=1e-4)
-
-
-def moving(heights, x=(0.0, 1.0, 4.0, 5.0), mirror=None, **changes):
-    """A motion of four particles in a row, with these heights (F, 4) over ground at 4 cells."""
-    c = 1 / 16
-    floor = Ground.floor(4 * c, thickness=c)
-    scene = small_scene(walls=(), ground=(floor,), **changes)
-    heights = np.asarray(heights, float)
-    position = np.zeros((len(heights), 2, len(x)), np.float32)
-    position[:, 0] = (4.25 + 0.5 * np.array(x)) * c
-    position[:, 1] = (4.0 + heights) * c
-    return Motion(
-        "it", scene, np.arange(len(heights)), position, 0.0 * position,
-        np.zeros((len(heights), 4, len(x)), np.float32), np.ones(len(x)),
-        np.zeros((len(heights), len(x)), np.float32), 1.0, np.zeros(len(heights)),
-    )  # fmt: skip
-
-
-def test_feet_are_neighbours_that_touch_and_stand_in_a_row():
-    motion = moving([(1.5, 1.5, 1.5, 1.5), (1.5, 0.5, 2.0, 2.0), (1.5, 2.0, 0.9, 0.5)])
-    back, front = feet(motion)
-    assert (back.name, front.name) == ("foot 1", "foot 2")
-    assert (back.particles.tolist(), front.particles.tolist()) == ([1], [2, 3])
-    assert back.height * 16 == pytest.approx([1.5, 0.5, 2.0])
-    assert front.height * 16 == pytest.approx([1.5, 2.0, 0.5])
-    assert back.touches.tolist() == [False, True, False]
-    assert front.touches.tolist() == [False, False, True]
-    west = dataclasses.replace(motion, scene=dataclasses.replace(motion.scene, direction=(-1, 0)))
-    assert [foot.particles.tolist() for foot in feet(west)] == [[2, 3], [1]]
-
-
-def test_what_never_touches_or_is_void_is_no_foot():
-    motion = moving([(1.5, 1.5, 1.5, 1.5), (0.5, 2.0, 2.0, 2.0)])
-    assert len(feet(motion)) == 1
-    assert feet(dataclasses.replace(motion, gamma=np.array([0.2, 1.0, 1.0, 1.0]))) == []
-    assert feet(moving([(1.5, 1.5, 1.5, 1.5)])) == []
 
 
 def test_a_designs_picture_has_a_pixel_for_each_particle():

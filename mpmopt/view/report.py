@@ -14,7 +14,6 @@ import logging
 import os
 import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass
 from importlib import resources
 from io import BytesIO
 from pathlib import Path
@@ -23,8 +22,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
-from scipy.ndimage import label
 
+from mpmopt.assess.feet import feet
 from mpmopt.assess.trajectory import Body, Motion, equal_steps, optimised, post_processed, reference
 from mpmopt.errors import SimulationError
 from mpmopt.io.console import command
@@ -41,30 +40,7 @@ PER_PERIOD = 16  # instants of a film in one period of the fastest actuator; bet
 FEWEST, MOST = 80, 320  # instants of a film
 PLACES = 65535  # steps of a place within a film's box
 STRETCHES = 64  # steps of one in a deformation gradient, up to nearly 2
-FEET = 6  # that are shown at most
-# Of the one that touches longest: what touches for less than this share of that is no foot.
-RARELY = 0.05
-NEAR = 0.75  # cells from a wall within which a particle touches it
 SOLID, ACTUATOR, EMPTY = (70, 70, 76, 255), (*(round(255 * c) for c in RED), 235), (0, 0, 0, 0)
-
-
-@dataclass(frozen=True)
-class Foot:
-    """Neighbouring particles that touch a support at some time.
-
-    Attributes
-    ----------
-    name : str
-    particles : (K,) array of int
-    height : (F,) array
-        Of the lowest of them above the support.
-    touches : (F,) array of bool
-    """
-
-    name: str
-    particles: NDArray[np.int64]
-    height: NDArray[np.float64]
-    touches: NDArray[np.bool_]
 
 
 def report(
@@ -147,8 +123,8 @@ def _film(body: Body) -> dict[str, Any]:
     drawn = np.flatnonzero(motion.gamma >= FAINTEST)
     order = drawn[np.argsort(motion.gamma[drawn], kind="stable")]
     e = np.array(scene.direction)
-    mean = np.einsum("fkm,m->fk", motion.position.astype(float), motion.gamma) / motion.gamma.sum()
-    travel, rise = ((mean - mean[0]) @ axis for axis in (e, np.array([-e[1], e[0]])))
+    moved = motion.centroid - motion.centroid[0]
+    travel, rise = (moved @ axis for axis in (e, np.array([-e[1], e[0]])))
     place = np.empty(len(motion.gamma), np.int64)
     place[order] = np.arange(len(order))
     actuation = motion.actuation[:, order]
@@ -216,51 +192,6 @@ def _solids(scene: Scene, box: NDArray[np.float64], spacing: float) -> list[NDAr
         if left < right and low < high:
             solids.append(np.array([(left, low), (right, low), (right, high), (left, high)]))
     return solids
-
-
-def feet(motion: Motion) -> list[Foot]:
-    """The feet of a body: what of it touches ground or walls at some time, from back to front.
-
-    A particle touches ground in its layer, and a wall within `NEAR` of a cell. Particles that do
-    are one foot if they are neighbours before they move. Of a scene with a mirror, feet are those
-    of the simulated half.
-    """
-    scene, half = motion.scene, len(motion.gamma) // (1 if motion.scene.mirror is None else 2)
-    position = motion.position[:, :, :half].astype(float)
-    supports = [
-        (layer.line.distance(np.moveaxis(position, 1, 0))[0], layer.thickness)
-        for layer in scene.layers
-    ]
-    for wall in scene.walls:
-        away = position[:, "xy".index(wall.axis)] - wall.position
-        near = NEAR * scene.grid.dx
-        supports.append((away if wall.solid_side == "below" else -away, near))
-    index = np.floor(position[0] / motion.spacing).astype(int)
-    i, j = index - index.min(axis=1, keepdims=True)
-    found: list[tuple[int, NDArray[np.int64], NDArray[np.float64], NDArray[np.bool_]]] = []
-    for number, (height, near) in enumerate(supports):
-        close = (height < near) & (motion.gamma[:half] >= 0.5)
-        lattice = np.zeros((i.max() + 1, j.max() + 1), dtype=bool)
-        touching = close.any(axis=0)
-        lattice[i[touching], j[touching]] = True
-        labels = np.where(touching, label(lattice, np.ones((3, 3)))[0][i, j], 0)
-        for foot in range(1, labels.max(initial=0) + 1):
-            particles = np.flatnonzero(labels == foot)
-            lowest = height[:, particles].min(axis=1)
-            touches = np.array(close[:, particles].any(axis=1))
-            found.append((number, particles, lowest, touches))
-    most = max((touches.sum() for *_, touches in found), default=0)
-    found = [each for each in found if each[-1].sum() > RARELY * most]
-    found = sorted(found, key=lambda each: -each[-1].sum())[:FEET]
-    ahead = np.array(scene.direction) @ position[0]
-    found.sort(key=lambda each: (each[0], float(ahead[each[1]].mean())))
-    several = len({number for number, *_ in found}) > 1
-    names = [f"ground {k}" for k in range(len(scene.layers))]
-    names += [f"wall {k}" for k in range(len(scene.walls))]
-    return [
-        Foot(f"foot {k}{f' on {names[number]}' if several else ''}", particles, height, touches)
-        for k, (number, particles, height, touches) in enumerate(found, 1)
-    ]
 
 
 def _history(run: Optimisation) -> dict[str, Any]:
