@@ -1,6 +1,7 @@
 """The report of a run: its numbers, and its page in a real browser."""
 
 import base64
+import dataclasses
 import json
 import zlib
 from io import BytesIO
@@ -15,6 +16,8 @@ from PIL import Image
 from mpmopt.__main__ import main
 from mpmopt.assess.trajectory import Motion, optimised, post_processed
 from mpmopt.design.problem import Problem
+from mpmopt.design.task import Task
+from mpmopt.design.variation import Variation
 from mpmopt.errors import DesignError, SimulationError
 from mpmopt.results import runfile
 from mpmopt.scene.particles import discretise
@@ -142,6 +145,20 @@ def test_a_body_that_cannot_be_simulated_is_left_out(
         "post-processed design"
     ]
     assert "without a body: step 3, body: it burst" in caplog.text
+
+
+def test_the_design_is_filmed_in_each_scene_of_an_ensemble(short_run, short_path, tmp_path):
+    task = Task(scenes=(Variation(strength=0.5), Variation(refinement=2)))
+    history = [dataclasses.replace(item, scenes=(0.4, 0.5)) for item in short_run.history]
+    run = dataclasses.replace(short_run, task=task, history=history)
+    report(tmp_path / "a.html", run, {}, {}, short_path)
+    data = data_of(tmp_path / "a.html")
+    plain, _, _, weak, fine = data["films"]
+    assert weak["name"] == "post-processed design in scene 1: strength 0.5"
+    assert fine["name"] == "post-processed design in scene 2: refinement 2"
+    assert fine["particles"] == 4 * plain["particles"]
+    assert weak["motion"] != plain["motion"]
+    assert data["history"]["scenes"][0] == pytest.approx([0.4 - 5 / 16, 0.5 - 5 / 16])
 
 
 def test_a_run_without_a_design_has_no_report(short_path, tmp_path):

@@ -38,7 +38,7 @@ def ending(path: str | os.PathLike[str]) -> str:
     lines = {
         run.measure: _travel(run, summary),
         "gain": _gain(summary),
-        **_friction(summary),
+        **_elsewhere(summary),
         "pieces": _pieces(summary),
         "chosen": f"evaluation {run.chosen} of {len(run.history)}, stage {best.stage + 1} of "
         f"{last}, beta {best.beta:g}",
@@ -77,16 +77,20 @@ def _gain(summary: Mapping[str, Any]) -> str:
     return f"{_shown(summary['gain']['as designed'])} over the solid block; retained: {shares}"
 
 
-def _friction(summary: Mapping[str, Any]) -> dict[str, str]:
-    speeds = summary.get("speed_by_friction")
-    if not isinstance(speeds, Mapping) or not speeds:
+def _elsewhere(summary: Mapping[str, Any]) -> dict[str, str]:
+    """What the short study found (`robustness.study`), if the scene has one."""
+    if "speed" not in summary:
         return {}
-    return {"friction": ", ".join(f"{name}: {_shown(speed)}" for name, speed in speeds.items())}
+    table = summary["speed_by_friction"].items()
+    by_friction = ", ".join(f"{_shown(speed)} at {friction}" for friction, speed in table)
+    driven = summary["driven_share"]
+    share = "" if driven is None else f"; {driven:.0%} of the speed is driven"
+    return {"speed": f"{_shown(summary['speed'])}{share}; by friction: {by_friction}"}
 
 
 def _pieces(summary: Mapping[str, Any]) -> str:
-    loose = summary["disconnected_particles"]
-    return f"{loose} particles hang on nothing" if loose else "one, nothing is loose"
+    loose, count = summary["disconnected_particles"], summary["components"]
+    return f"{count}, {loose} particles hang on nothing" if loose else f"{count}, nothing is loose"
 
 
 def _files(path: Path) -> list[str]:

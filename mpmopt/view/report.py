@@ -13,7 +13,8 @@ import json
 import logging
 import os
 import zlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from importlib import resources
 from io import BytesIO
 from pathlib import Path
@@ -24,7 +25,17 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from mpmopt.assess.feet import feet
-from mpmopt.assess.trajectory import Body, Motion, equal_steps, optimised, post_processed, reference
+from mpmopt.assess.refinement import mapped
+from mpmopt.assess.trajectory import (
+    Body,
+    Motion,
+    equal_steps,
+    optimised,
+    post_processed,
+    reference,
+    solid,
+)
+from mpmopt.design.problem import Problem
 from mpmopt.errors import SimulationError
 from mpmopt.io.console import command
 from mpmopt.io.files import replace_file
@@ -37,7 +48,7 @@ from mpmopt.view.film import periods, playing_time
 logger = logging.getLogger(__name__)
 
 PER_PERIOD = 16  # instants of a film in one period of the fastest actuator; between, it is straight
-FEWEST, MOST = 80, 320  # instants of a film
+FEWEST, MOST, MOST_IN_ALL = 80, 320, 960  # instants of a film, and of all together
 PLACES = 65535  # steps of a place within a film's box
 STRETCHES = 64  # steps of one in a deformation gradient, up to nearly 2
 SOLID, ACTUATOR, EMPTY = (70, 70, 76, 255), (*(round(255 * c) for c in RED), 235), (0, 0, 0, 0)
@@ -70,10 +81,10 @@ def report(
         If the file cannot be written.
     """
     problem, x = run.problem(), run.result.x
-    films = []
-    for make in (post_processed, optimised, reference):
+    films, bodies = [], _bodies(problem, x)
+    for make in bodies:
         try:
-            films.append(_film(make(problem, x)))
+            films.append(_film(make(), min(MOST, MOST_IN_ALL // len(bodies))))
         except SimulationError as error:
             logger.warning("the report is without a body: %s", error)
     name = source.absolute().parent.name or str(source)
@@ -114,10 +125,25 @@ def _base64(values: NDArray[np.uint8]) -> str:
     return base64.b64encode(values.tobytes()).decode()
 
 
-def _film(body: Body) -> dict[str, Any]:
-    """A body in motion, as the page's script reads it."""
+def _bodies(problem: Problem, x: NDArray[np.float64]) -> list[Callable[[], Body]]:
+    """What makes each body that is filmed: the design without grey also in each of its scenes."""
+    made: list[Callable[[], Body]] = [
+        partial(make, problem, x) for make in (post_processed, optimised, reference)
+    ]
+    for number, (variation, member) in enumerate(zip(problem.task.scenes, problem.members), 1):
+        name = f"post-processed design in scene {number}: {variation}"
+        made.append(partial(_in_scene, name[:100], problem, member, x))
+    return made
+
+
+def _in_scene(name: str, problem: Problem, member: Problem, x: NDArray[np.float64]) -> Body:
+    return solid(name, member, x, mapped(member.scene, problem, x))
+
+
+def _film(body: Body, most: int) -> dict[str, Any]:
+    """A body in motion at no more than so many instants, as the page's script reads it."""
     scene = body.simulation.scene
-    count = int(np.clip(round(PER_PERIOD * periods(scene)), FEWEST, MOST)) + 1
+    count = int(np.clip(round(PER_PERIOD * periods(scene)), FEWEST, most)) + 1
     motion = Motion.of(body, np.unique(equal_steps(scene, count)))
     box = view([motion])
     drawn = np.flatnonzero(motion.gamma >= FAINTEST)
@@ -197,12 +223,13 @@ def _solids(scene: Scene, box: NDArray[np.float64], spacing: float) -> list[NDAr
 def _history(run: Optimisation) -> dict[str, Any]:
     names = (
         "stage", "beta", "objective", "post_processed", "refined", "non_discreteness", "violation",
-        "halved", "seconds", "failure",
+        "halved", "seconds", "failure", "scenes",
     )  # fmt: skip
     zero = run.origin
     columns: dict[str, Any] = {name: [getattr(i, name) for i in run.history] for name in names}
     for name in ("objective", "post_processed", "refined"):
         columns[name] = [value - zero for value in columns[name]]
+    columns["scenes"] = [[value - zero for value in values] for values in columns["scenes"]]
     columns["unit"], columns["chosen"] = run.measure, run.chosen
     return columns
 
@@ -308,7 +335,7 @@ def _commands(source: Path) -> dict[str, str]:
             "-c", AGAIN.format(path=json.dumps(path))
         ),
         "check its gradients": command("-m", "mpmopt", "verify", path),
-        "test it in other discretisations": command("-m", "mpmopt", "refine", path),
+        "try it elsewhere, and in other discretisations": command("-m", "mpmopt", "study", path),
         "film it": command("-m", "mpmopt", "film", path),
         "take it out, 60 mm wide": command(
             "-m", "mpmopt", "export", path, "--svg", "--width", "60"
