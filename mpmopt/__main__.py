@@ -439,7 +439,7 @@ def _parser() -> argparse.ArgumentParser:
         "write how its best design moves as a table",
         "Write trajectory.csv, of the best design without void, in the scene's units: time, place\n"
         "and velocity of the centroid, travel, the actuators' signals, and for each foot its\n"
-        "height and whether it touches.",
+        "height and whether it stands.",
         "out/walker/run.h5",
         "out/walker/run.h5 --out walker.csv",
     )

@@ -16,7 +16,7 @@ from mpmopt.results.trajectory import table
 from mpmopt.scene import Ground
 
 
-def moving(heights, x=(0.0, 1.0, 4.0, 5.0), mirror=None, **changes):
+def moving(heights, x=(0.0, 1.0, 6.0, 7.0), **changes):
     """A motion of four particles in a row, with these heights (F, 4) over ground at 4 cells."""
     c = 1 / 16
     floor = Ground.floor(4 * c, thickness=c)
@@ -39,8 +39,8 @@ def test_feet_are_neighbours_that_touch_and_stand_in_a_row():
     assert (back.particles.tolist(), front.particles.tolist()) == ([1], [2, 3])
     assert back.height * 16 == pytest.approx([1.5, 0.5, 2.0])
     assert front.height * 16 == pytest.approx([1.5, 2.0, 0.5])
-    assert back.touches.tolist() == [False, True, False]
-    assert front.touches.tolist() == [False, False, True]
+    assert back.stands.tolist() == [False, True, False]
+    assert front.stands.tolist() == [False, False, True]
     west = dataclasses.replace(motion, scene=dataclasses.replace(motion.scene, direction=(-1, 0)))
     assert [foot.particles.tolist() for foot in feet(west)] == [[2, 3], [1]]
 
@@ -64,7 +64,7 @@ def test_feet_of_a_channel_are_those_of_the_simulated_half(axis):
     assert found
     for foot in found:
         assert foot.particles.max() < half
-        assert foot.touches.any()
+        assert foot.stands.any()
 
 
 def test_a_table_tells_where_the_body_is_and_what_drives_it(short_run, short_path, tmp_path):
@@ -86,5 +86,5 @@ def test_a_table_tells_where_the_body_is_and_what_drives_it(short_run, short_pat
     for k in (0, 1):
         signal = body.simulation.signal[:, k]
         assert column[f"signal {k}"][:40] == pytest.approx(signal, abs=1e-8)
-    touches = [name for name in column if name.endswith("touches")]
-    assert touches and all(set(column[name]) <= {0.0, 1.0} for name in touches)
+    stands = [name for name in column if name.endswith("stands")]
+    assert stands and all(set(column[name]) <= {0.0, 1.0} for name in stands)

@@ -18,7 +18,7 @@ def table(body: Body) -> str:
 
     The columns are time; place and velocity of the centroid of all material, x, y, vx, vy; its
     travel along the scene's direction; signal 0, 1, ... of the actuators; and of each foot
-    (`feet`) its height, and 1 where it touches.
+    (`feet`) its height, and 1 where it stands.
 
     Parameters
     ----------
@@ -43,7 +43,7 @@ def table(body: Body) -> str:
         columns[f"signal {number}"] = signal
     for foot in feet(motion):
         columns[f"{foot.name}, height"] = foot.height
-        columns[f"{foot.name}, touches"] = foot.touches.astype(int)
+        columns[f"{foot.name}, stands"] = foot.stands.astype(int)
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(columns)

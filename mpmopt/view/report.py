@@ -175,7 +175,7 @@ def _film(body: Body, most: int) -> dict[str, Any]:
                 "name": foot.name,
                 "particles": place[foot.particles],
                 "height": foot.height,
-                "touches": foot.touches.astype(int),
+                "stands": foot.stands.astype(int),
             }
             for foot in feet(motion)
         ],
