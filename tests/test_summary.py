@@ -116,9 +116,9 @@ def test_a_summary_is_of_the_best_design_and_counts_all_evaluations(told):
 
 def test_a_cost_of_transport_is_that_of_the_body_without_grey(told, monkeypatch):
     told((0.1,) * 4, (0.5,) * 4)
-    assert summarise(finished(), {})["cost_of_transport"] == 1.5
+    assert summarise(finished())["cost_of_transport"] == 1.5
     monkeypatch.setattr(summary, "books", lambda simulation: SimpleNamespace(cost_of_transport=inf))
-    assert summarise(finished(), {})["cost_of_transport"] is None
+    assert summarise(finished())["cost_of_transport"] is None
 
     def count(simulation):
         return SimpleNamespace(cost_of_transport=len(simulation.particles.position))
@@ -127,7 +127,7 @@ def test_a_cost_of_transport_is_that_of_the_body_without_grey(told, monkeypatch)
     low = np.where(np.arange(32) < 8, 1.0, -1.0)
     best = candidate(low, 0.75).x
     there = len(PROBLEM.particles.position) - 32 + threshold.kept(PROBLEM, best).sum()
-    assert summarise(finished(low), {})["cost_of_transport"] == there
+    assert summarise(finished(low))["cost_of_transport"] == there
 
 
 def test_loose_particles_are_those_that_hang_on_nothing(told):

@@ -7,6 +7,7 @@ import numpy as np
 from mpmopt.errors import SimulationError
 from mpmopt.scene import Grid, Material, Scene, Solid
 from mpmopt.scene.particles import discretise
+from mpmopt.scene.scene import Formulation
 from mpmopt.simulation.lagrangian import LagrangianSimulation
 from stability.common import Array, Found, Line, Measured, Points, at_rest, solid
 
@@ -61,7 +62,7 @@ class Vortex:
         return float(np.sqrt((miss**2).sum(axis=0).mean())) / self.amplitude
 
 
-def square(cells: int, courant: float, formulation: str = "updated") -> Scene:
+def square(cells: int, courant: float, formulation: Formulation = "updated") -> Scene:
     """The solution has no displacement outside the ring: any body that holds it will do."""
     dx = 2.0 * CENTRE / cells
     return Scene(

@@ -368,11 +368,11 @@ def push_apart_adjoint(
 
 def grips(
     stiffness: NDArray, modulus: NDArray[np.float64], spacing: float, dx: float
-) -> tuple[NDArray, NDArray[np.float64]]:
+) -> tuple[NDArray, NDArray]:
     """g of particles and its derivative by gamma, from gamma and the modulus of their solid.
 
     g^2 = 2 m_p (c_p / h)^2 of solid, where m_p c_p^2 is its area times lambda + 2 mu.
     """
     above = stiffness.real > LEAST_STIFFNESS
-    slope = above * np.sqrt(2.0 * modulus) * spacing / (dx * (1.0 - LEAST_STIFFNESS))
+    slope: NDArray = above * np.sqrt(2.0 * modulus) * spacing / (dx * (1.0 - LEAST_STIFFNESS))
     return slope * (stiffness - LEAST_STIFFNESS), slope

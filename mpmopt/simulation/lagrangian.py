@@ -284,16 +284,40 @@ class LagrangianSimulation(Simulation):
     def look(self, nodes: NDArray) -> Indicators:
         """Indicators of a state of the nodes: Courant number, smallest J of solid, and gap.
 
-        The Courant number is that of `Simulation`, of which a particle alone in its cell bears 0.9;
-        blocks bear more. Solid cannot tear here, and no energy is counted.
+        Of the Courant number a particle alone in its cell bears 0.9; blocks bear more. Solid cannot
+        tear here, and no energy is counted.
         """
         records = self._records(nodes)
-        courant = self.indicators(records).courant
         gap, gap_x, gap_y = self.gap(records)
-        f00, f01, f10, f11 = records.real.reshape(-1, kernels.STATE_SIZE, 4)[:, 8:].swapaxes(0, 1)
-        J = f00 * f11 - f01 * f10
-        smallest = float(J[self._solid].min(initial=math.inf))
+        F = records.real.reshape(-1, kernels.STATE_SIZE, 4)[:, 8:].swapaxes(0, 1)
+        F = F[:, self._solid]
+        courant, smallest = 0.0, math.inf
+        if F.size:
+            courant, smallest = self._courant(F), float((F[0] * F[3] - F[1] * F[2]).min())
         return Indicators(courant, jacobian=smallest, gap=gap, gap_x=gap_x, gap_y=gap_y)
+
+    def _courant(self, F: NDArray) -> float:
+        """Largest Courant number k_v + sqrt(k_v^2 + k_e^2) of solid as stretched as it is.
+
+        Void, which is crushed and turned inside out, moves with the solid around it.
+
+        Against dF = a N, a wave along N, the tangent of `kernels.lagrangian.solid_stress` has the
+        stiffness M = mu + h' s^2 with h = (lambda ln J - mu) (ln J)' and the larger stretch s; its
+        viscosity is eta s^2. k_e^2 = (dt / dx)^2 M / rho, k_v = dt / dx^2 eta s^2 / rho.
+        """
+        f00, f01, f10, f11 = F
+        J, trace = f00 * f11 - f01 * f10, f00**2 + f01**2 + f10**2 + f11**2
+        s2 = 0.5 * (trace + np.sqrt(np.maximum(trace**2 - 4.0 * J**2, 0.0)))
+        inside = np.maximum(J, lagrangian.LEAST_J)
+        slope = 1.0 / inside - (J - inside) / inside**2
+        log = np.log(inside) + (J - inside) / inside - 0.5 * ((J - inside) / inside) ** 2
+        lam, mu, eta = self.data.constants[:, self._solid]
+        hardening = lam * slope**2 - (lam * log - mu) / inside**2
+        stiffness = mu + np.maximum(hardening, 0.0) * s2
+        specific = (self.data.stiffness * self.data.volume / self.data.mass).real[self._solid]
+        step = self.scene.time_step / self.scene.grid.dx
+        viscous = step / self.scene.grid.dx * eta * s2 * specific
+        return float(np.max(viscous + np.sqrt(viscous**2 + step**2 * stiffness * specific)))
 
     def checkpoints(self, wish: Checkpointing) -> Checkpoints:
         """As `Simulation.checkpoints`; what is stored are states of nodes."""
