@@ -314,7 +314,11 @@ class LagrangianSimulation(Simulation):
         lam, mu, eta = self.data.constants[:, self._solid]
         hardening = lam * slope**2 - (lam * log - mu) / inside**2
         stiffness = mu + np.maximum(hardening, 0.0) * s2
-        specific = (self.data.stiffness * self.data.volume / self.data.mass).real[self._solid]
+        stiffness_share, volume, mass = (
+            each[self._solid].real
+            for each in (self.data.stiffness, self.data.volume, self.data.mass)
+        )
+        specific = stiffness_share * volume / mass
         step = self.scene.time_step / self.scene.grid.dx
         viscous = step / self.scene.grid.dx * eta * s2 * specific
         return float(np.max(viscous + np.sqrt(viscous**2 + step**2 * stiffness * specific)))
