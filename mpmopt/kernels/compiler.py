@@ -44,8 +44,13 @@ OPTIONS: dict[str, Any] = {
     "fastmath": {"contract", "reassoc", "nsz", "arcp"},
 }
 
-# Without the counting of references to arrays.
-BARE: dict[str, Any] = {**OPTIONS, "_nrt": False}
+# Without the counting of references to arrays, and for compiled callers alone.
+BARE: dict[str, Any] = {
+    **OPTIONS,
+    "_nrt": False,
+    "no_cpython_wrapper": True,
+    "no_cfunc_wrapper": True,
+}
 
 
 def loop_jit(function: Callable[..., Any]) -> Any:
@@ -65,7 +70,8 @@ def jit(function: Callable[..., Any]) -> Any:
 def bare_jit(function: Callable[..., Any]) -> Any:
     """As `jit`, for kernels that make no arrays: they count no references to those they take.
 
-    Counting costs more than a short kernel does whose tuples hold many arrays.
+    Counting costs more than a short kernel does whose tuples hold many arrays. Only compiled code
+    calls them.
     """
     return _stamped(njit(**BARE, forceinline=True)(function))
 
