@@ -374,5 +374,6 @@ def grips(
     g^2 = 2 m_p (c_p / h)^2 of solid, where m_p c_p^2 is its area times lambda + 2 mu.
     """
     above = stiffness.real > LEAST_STIFFNESS
-    slope: NDArray = above * np.sqrt(2.0 * modulus) * spacing / (dx * (1.0 - LEAST_STIFFNESS))
+    scale = spacing / (dx * (1.0 - LEAST_STIFFNESS))
+    slope: NDArray[np.float64] = np.where(above, scale * np.sqrt(2.0 * modulus), 0.0)
     return slope * (stiffness - LEAST_STIFFNESS), slope
