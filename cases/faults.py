@@ -2,7 +2,7 @@
 
     python cases/faults.py --out out/faults [--quick]
 
-Each run is a small walker with four starts, a coarse stage and a solid one. It counts as survived
+Each run is a small walker with four starts, three stages. It counts as survived
 if it ends, gone on with after the fault, in the same file as a run that nothing happened to, number
 by number; only the seconds differ.
 """
@@ -46,7 +46,7 @@ SMALL = case.Case(
     dataclasses.replace(walker(64, 8e-4), steps=200),
     Settings(
         (
-            Stage(0.5, 1e-2, 1e-3, 1.6e-3, coarsening=2),
+            Stage(0.5, 1e-2, 1e-3, 8e-4),
             Stage(2.0, 1e-2, 1e-3, 8e-4),
             Stage(8.0, 1e-2, 1e-3, 8e-4, solid=True, void_cutoff=0.05),
         ),

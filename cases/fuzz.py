@@ -429,8 +429,8 @@ CHANGES: list[Callable[[h5py.File], Any]] = [
     lambda f: f["stage/mma"].pop("lower"),
     _dataset("stage/mma/x_previous", data=np.full(3, np.nan)),
     _dataset("stage/values", data=np.zeros(0)),
-    lambda f: f.create_dataset("baseline/1", data=np.zeros(3)),
-    lambda f: f.create_dataset("baseline/x", data=np.zeros(3, bool)),
+    lambda f: f.create_dataset("baseline", data=np.zeros(3)),
+    lambda f: f.create_group("baseline"),
 ]
 
 

@@ -141,21 +141,9 @@ def test_a_baseline_that_is_none_is_found_before_anything_is_written(tmp_path, b
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_baseline_is_looked_at_on_the_grid_of_every_stage(tmp_path):
-    stages = (dataclasses.replace(STAGE, coarsening=2), STAGE)
-    scene = small_scene(
-        steps=4,
-        body=(
-            Design((4 * C, 4 * C), (8 * C, 6 * C)),
-            Actuator((4 * C, 6 * C), (8 * C, 8 * C)),
-        ),
-        walls=(),
-    )
-    case = Case(scene, dataclasses.replace(SHORT, stages=stages), lambda p: np.ones(8, bool))
-    with pytest.raises(DesignError, match=r"\(8,\) for positions of shape \(32, 2\)"):
-        run(case, tmp_path)
-    listed = dataclasses.replace(case, baseline=lambda position: [True] * len(position))
-    assert {k: v.size for k, v in baseline_particles(listed).items()} == {2: 8, 1: 32}
+def test_a_baseline_may_be_a_list():
+    listed = dataclasses.replace(CASE, baseline=lambda position: [True] * len(position))
+    assert baseline_particles(listed).tolist() == 32 * [True]
 
 
 def pieces(*body, **changes):

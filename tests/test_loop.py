@@ -1,12 +1,12 @@
 """Stages, stop rule, the best design, and evaluations that fail."""
 
 import dataclasses
+import itertools
 from typing import Any
 
 import numpy as np
 import pytest
 from conftest import small_scene
-from walker import walker
 
 from mpmopt.assess import refinement
 from mpmopt.design import chain
@@ -92,28 +92,20 @@ def test_each_stage_starts_from_the_last_ones_best(scene, start):
     assert np.array_equal(second.x, last_of_first.x)
 
 
-def test_a_coarse_stage_hands_its_farthest_design_to_the_finer_grid(monkeypatch):
-    without_void = iter((0.3, 0.2, 0.1))  # unlike the objective, which rises
+def test_a_stage_hands_its_farthest_design_to_the_next(scene, start, monkeypatch):
+    without_void = itertools.count(0.3, -0.1)  # unlike the objective, which rises
     monkeypatch.setattr(
         "mpmopt.optimisation.loop.post_processed", lambda problem, x: next(without_void)
     )
-    scene = walker(128, 4e-4)
-    scene = dataclasses.replace(scene, steps=100)
-    stages = (
-        Stage(0.5, 1e-2, 1e-3, 8e-4, solid=True, coarsening=2),
-        Stage(1.0, 1e-2, 1e-3, 4e-4),
-    )
+    stages = (dataclasses.replace(STAGES[0], solid=True), STAGES[1])
     settings = Settings(stages, window=1, least_iterations=3, most_iterations=3)
-    coarse = Problem(stages[0].scene(scene))
-    run, designs = tried(scene, settings, coarse.join(0.0, 1.0, -0.3, -0.5))
-    first, second = (next(item for item in designs if item.stage == stage) for stage in (0, 1))
-    assert 4 * (first.x.size - 3) == second.x.size - 3
+    run, designs = tried(scene, settings, start)
+    second = next(item for item in designs if item.stage == 1)
     # The incumbent as it is goes on, though the best is the incumbent without void.
     incumbent = max((i for i in designs if i.stage == 0), key=lambda item: item.objective)
     assert incumbent is not run.best[0]
-    assert np.array_equal(second.x, Problem(scene).transfer(coarse, incumbent.x))
+    assert np.array_equal(second.x, incumbent.x)
     assert second.step == 0.0
-    assert run.result.stage == 1  # whatever the coarse grid says
 
 
 def test_the_moving_average_ends_a_stage(scene, start):
@@ -304,11 +296,10 @@ def test_a_stage_that_never_runs_gives_up_after_three_halvings(scene, start, mon
         {"void_density": None},
         {"time_step": 0.0},
         {"void_stiffness": np.nan},
-        {"coarsening": 0},
         {"move_limit": 0.0},
         {"move_limit": 1.5},
         {"move_limit": "a"},
-        {"coarsening": 1.5},
+        {"most_iterations": 1.5},
         {"void_cutoff": -0.1},
         {"void_cutoff": 1.0},
         {"refined": True},

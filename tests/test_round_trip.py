@@ -69,8 +69,8 @@ def asymptotes():
 @pytest.fixture
 def run():
     stages = [
-        distinct(Stage, refined=True, solid=True, coarsening=2),
-        distinct(Stage, refined=True, solid=True, coarsening=2),
+        distinct(Stage, refined=True, solid=True),
+        distinct(Stage, refined=True, solid=True),
     ]
     settings = distinct(Settings, stages=tuple(stages), least_iterations=3, most_iterations=5)
     state = distinct(
@@ -98,7 +98,7 @@ def run():
 
 
 def test_every_field_of_a_run_comes_back_from_its_file(run, tmp_path):
-    baseline = {2: np.array([True, False, True])}
+    baseline = np.array([True, False, True])
     runfile.write(tmp_path / "run.h5", run, {"start": 0.25, "a": [1.0, None]}, baseline)
     back = runfile.read_run(tmp_path / "run.h5")
     for field in dataclasses.fields(Optimisation):

@@ -165,12 +165,6 @@ def test_another_time_step_keeps_the_duration(scene):
         scene.vary(time_step=3e-3)
 
 
-def test_a_coarser_scene_is_the_same_body():
-    assert walker(128, 8e-4).vary(coarsening=2) == walker(64, 8e-4)
-    with pytest.raises(SceneError, match=r"\(128, 128\) are no multiples of coarsening = 3"):
-        walker(128, 4e-4).vary(coarsening=3)
-
-
 WIDE = Grid((10**8, 10**8), C)
 
 

@@ -136,7 +136,7 @@ def test_a_run_with_constraints_goes_on_from_its_file_to_the_bit(tmp_path):
 def test_a_summary_tells_value_and_multiplier_of_each_constraint():
     task = Task(subject_to=(AtMost(Volume(), 0.4),))
     run = optimise(SCENE, dataclasses.replace(SETTINGS, most_iterations=2), START, task=task)
-    summary = summarise(run, {})
+    summary = summarise(run)
     expected = [run.result.constraints[0], run.result.multipliers[0]]
     assert summary["constraints"] == {"Volume() at most 0.4: value, multiplier": expected}
     assert "constraints, Volume() at most 0.4: value, multiplier" in table(summary)

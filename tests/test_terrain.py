@@ -9,7 +9,7 @@ import terrain
 from mpmopt.assess.threshold import solid_body
 from mpmopt.design.problem import Problem
 from mpmopt.kernels import parts
-from mpmopt.scene import Scene
+from mpmopt.scene import Grid, Scene
 
 PUSHED = 0.2  # seconds of a body that a slanted gravity pushes along the ground
 LAYER = terrain.FLAT.ground[0].thickness
@@ -18,7 +18,8 @@ LAYER = terrain.FLAT.ground[0].thickness
 def pushed(scene, seconds=PUSHED):
     """Solid body on coarse cells and on that ground, pushed to the right: gaps and positions."""
     scene = replace(
-        scene.vary(coarsening=2, time_step=1.6e-3),
+        scene.vary(time_step=1.6e-3),
+        grid=Grid(tuple(n // 2 for n in scene.grid.cells), 2 * scene.grid.dx),
         steps=round(seconds / 1.6e-3),
         transient=0.0,
         gravity=(10.0, -10.0),

@@ -116,7 +116,7 @@ def test_other_units_lead_to_the_same_steps_bit_for_bit(plain, length, mass, tim
             if name not in ("seconds", "failure"):
                 found = getattr(there, name)
                 assert np.array_equal(units.get(name, 1.0) * value, found, equal_nan=True), name
-    one, two = summarise(one, {}), summarise(other, {})
+    one, two = summarise(one), summarise(other)
     for name in ("start", "reference", "optimised", "post_processed", "post_processed_half_step"):
         assert two[name] == (None if one[name] is None else length * one[name])
     assert [two[name] for name in ("retained_gain", "non_discreteness", "a", "theta", "b")] == [
@@ -143,7 +143,7 @@ def finished(path, scene):
     stages = (Stage(4.0, 1e-2, 1e-3, 4e-3, solid=True),)
     settings = Settings(stages, window=1, least_iterations=10, most_iterations=10, tolerance=0.0)
     done = optimise(scene, settings, Problem(scene).join(0.0, 1.0, -0.3, -0.5), [ProgressBar()])
-    summary = summarise(done, {})
+    summary = summarise(done)
     runfile.write(path, done, summary)
     return summary
 

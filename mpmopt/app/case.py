@@ -205,28 +205,25 @@ def resume(
         return _go_on(path, runfile.read_run(path), checkpointing)
 
 
-def baseline_particles(case: Case) -> dict[int, NDArray[np.bool_]]:
-    """Which design particles the case's baseline has, for each coarsening of its stages.
+def baseline_particles(case: Case) -> NDArray[np.bool_]:
+    """Which design particles (D,) the case's baseline has.
 
     Raises
     ------
     DesignError
         If it does not give (D,) of True and False.
     """
-    there = {}
-    for coarsening, stage in {stage.coarsening: stage for stage in case.settings.stages}.items():
-        particles = discretise(stage.scene(case.scene))
-        position = particles.position[particles.designed]
-        array, shape = np.asarray(case.baseline(position), dtype=object), (len(position),)
-        kinds = {type(value).__name__ for value in array.ravel().tolist()}
-        if array.shape != shape or not kinds <= {"bool", "bool_"}:
-            raise DesignError(
-                f"Case: baseline gave {', '.join(sorted(kinds))} of shape {array.shape} for "
-                f"positions of shape {position.shape}, must give bool of shape {shape}: whether "
-                "each particle is there"
-            )
-        there[coarsening] = array.astype(bool)
-    return there
+    particles = discretise(case.scene)
+    position = particles.position[particles.designed]
+    array, shape = np.asarray(case.baseline(position), dtype=object), (len(position),)
+    kinds = {type(value).__name__ for value in array.ravel().tolist()}
+    if array.shape != shape or not kinds <= {"bool", "bool_"}:
+        raise DesignError(
+            f"Case: baseline gave {', '.join(sorted(kinds))} of shape {array.shape} for "
+            f"positions of shape {position.shape}, must give bool of shape {shape}: whether "
+            "each particle is there"
+        )
+    return array.astype(bool)
 
 
 def _go_on(

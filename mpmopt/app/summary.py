@@ -27,13 +27,13 @@ logger = logging.getLogger(__name__)
 
 
 def summarise(
-    result: Optimisation, baseline: Mapping[int, NDArray[np.bool_]], full: bool = False
+    result: Optimisation, baseline: NDArray[np.bool_] | None = None, full: bool = False
 ) -> dict[str, Any]:
     """Objective values (L, larger is farther), actuation and counts of a finished optimisation.
 
     And the finished robot's `robustness.study`, in full or in short.
 
-    The baseline is that of `baseline_particles`, or empty.
+    The baseline (D,) is that of `baseline_particles`, or none.
 
     Reference designs count with the better of the first and the best design's actuation.
     """
@@ -42,7 +42,6 @@ def summarise(
     _, *others = rows = study(problem, best.x)
     first = result.first
     assert first is not None
-    there = baseline.get(result.settings.stages[best.stage].coarsening)
     actuations = [Variables.of(item.x, item.gamma.size) for item in (first, best)]
     actuation = actuations[1]
     reference = _value_or_none(
@@ -57,9 +56,9 @@ def summarise(
         "start": _value_or_none(lambda: first.objective),
         "reference": reference,
         "baseline": None
-        if there is None
+        if baseline is None
         else _value_or_none(
-            lambda: best_actuated(problem.scene, lambda _: there, *actuations, task=result.task)
+            lambda: best_actuated(problem.scene, lambda _: baseline, *actuations, task=result.task)
         ),
         "optimised": best.objective,
         "post_processed": _value_or_none(lambda: post_processed(problem, best.x)),

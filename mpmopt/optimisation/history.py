@@ -196,7 +196,7 @@ class Optimisation:
 
     @property
     def result(self) -> Candidate:
-        """The best evaluation on the last stage's grid.
+        """The best evaluation.
 
         That is the one that counts most (`Candidate.counted`), where stages ask for bodies without
         void, and of refined stages where there are some; else the best of the last stage that had
@@ -211,14 +211,12 @@ class Optimisation:
             last = f"; the last: {self.history[-1].failure}" if self.history else ""
             raise DesignError(f"there is no design: no evaluation succeeded yet{last}")
         stages = self.settings.stages
-        grid = stages[max(self.best)].coarsening
 
         def merit(item: Candidate) -> tuple[float, bool, float, int]:
             refined = stages[item.stage].refined and np.isfinite(item.counted)
             return -item.violation, bool(refined), item.counted, item.stage
 
-        on_grid = (item for stage, item in self.best.items() if stages[stage].coarsening == grid)
-        return max(on_grid, key=merit)
+        return max(self.best.values(), key=merit)
 
     def problem(self) -> Problem:
         """The problem that `result` solves, in the time step that it was evaluated with."""

@@ -170,10 +170,6 @@ def go_on(
 
     while run.stage < len(stages) and not run.gave_up:
         ascent = _Ascent(run, report, checkpointing, began)
-        if run.stage_state is None and run.stage:
-            before = stages[run.stage - 1]
-            if ascent.stage.coarsening != before.coarsening:
-                run.x = ascent.problem.transfer(Problem(before.scene(run.scene)), run.x)
         run.x, run.reason, run.gave_up = ascent.to_end()
         run.stage_state = None
         logger.info("stage %d: %s", run.stage, run.reason)
@@ -323,13 +319,9 @@ class _Ascent:
         return x
 
     def _best_before(self) -> NDArray[np.float64] | None:
-        """The best design of the stage before, on this stage's grid."""
+        """The best design of the stage before."""
         before = self.run.best.get(self.run.stage - 1)
-        if before is None or before.x.size == self.problem.size:
-            return before.x if before else None
-        return self.problem.transfer(
-            Problem(self.run.settings.stages[before.stage].scene(self.run.scene)), before.x
-        )
+        return before.x if before else None
 
     def _evaluate(self, x: NDArray[np.float64]) -> None:
         """Value and gradient, recorded, even of a simulation that failed."""

@@ -47,8 +47,6 @@ class Stage:
         Whether such a design counts with the least of this and of the same with half the step and
         with cells half as wide (`refinement.least`), so that the best is one that keeps its gain.
         This costs four gradients more for each design that goes farther than the best so far.
-    coarsening : int
-        How many of the scene's cells go into the width of this stage's: early stages need no more.
     move_limit : float
         Greatest step of a variable, as a fraction of its range.
     void_cutoff : float
@@ -73,7 +71,6 @@ class Stage:
     time_step: float
     solid: bool = False
     refined: bool = False
-    coarsening: int = 1
     move_limit: float = 0.05
     void_cutoff: float = 0.0
     most_iterations: int | None = None
@@ -89,7 +86,7 @@ class Stage:
         _take(self, flag, "solid refined limited")
         if self.refined and not self.solid:
             raise DesignError("Stage: refined = True needs solid = True")
-        _take(self, count, "most_iterations coarsening", least=1)
+        _take(self, count, "most_iterations", least=1)
         _take(self, count, "halvings", least=0)
 
     def scene(self, scene: Scene) -> Scene:
@@ -98,7 +95,6 @@ class Stage:
             time_step=self.time_step,
             void_density=self.void_density,
             void_stiffness=self.void_stiffness,
-            coarsening=self.coarsening,
         )
 
     def problem(

@@ -10,7 +10,7 @@ Layout (version 6)::
     stages/K/        the best design of stage K: x, gamma; attributes of its evaluation
     first/, last/    the first and the last evaluation, in the same way
     stage/           a stage that is under way: what its next step depends on
-    baseline/C       which particles the baseline design has, with C cells of the scene in one
+    baseline         which design particles the baseline design has; not there without one
 
 The file is sealed with a digest of all its bytes (`checksums`).
 """
@@ -62,22 +62,21 @@ class RunFile:
         Of this package and of those it computes with.
     summary : dict
         That of `summary.summarise`; empty if there is none yet.
-    baseline : dict of int to (D,) array of bool
-        Which design particles the baseline design has, for each coarsening of the stages; empty
-        if there is none.
+    baseline : (D,) array of bool, optional
+        Which design particles the baseline design has, if there is one.
     """
 
     run: Optimisation
     versions: dict[str, str]
     summary: dict[str, Any] = field(default_factory=dict)
-    baseline: dict[int, NDArray[np.bool_]] = field(default_factory=dict, repr=False)
+    baseline: NDArray[np.bool_] | None = field(default=None, repr=False)
 
 
 def write(
     path: str | os.PathLike[str],
     run: Optimisation,
     summary: Mapping[str, Any] | None = None,
-    baseline: Mapping[int, NDArray[np.bool_]] | None = None,
+    baseline: NDArray[np.bool_] | None = None,
 ) -> None:
     """Write a run as it stands; an older file of that name is replaced only by a complete one.
 
@@ -87,7 +86,7 @@ def write(
     run : Optimisation
     summary : mapping, optional
         Of a finished run.
-    baseline : mapping of int to (D,) array of bool, optional
+    baseline : (D,) array of bool, optional
         As in `RunFile`.
 
     Raises
@@ -100,8 +99,8 @@ def write(
     with file_in_memory() as file:
         _fill(file, run)
         file.attrs["summary"] = json.dumps(dict(summary or {}))
-        for coarsening, there in (baseline or {}).items():
-            file.create_dataset(f"baseline/{coarsening}", data=there, dtype="?")
+        if baseline is not None:
+            file.create_dataset("baseline", data=baseline, dtype="?")
         file.flush()
         image = file.id.get_file_image()
     if len(image) + SEAL > LARGEST:
@@ -230,8 +229,14 @@ def _read(file: h5py.File, path: Path) -> RunFile:
         run,
         versions=json.loads(file.attrs["versions"]),
         summary=dict(json.loads(file.attrs["summary"])),
-        baseline={int(name): item[:] for name, item in file.get("baseline", {}).items()},
+        baseline=_read_baseline(file["baseline"]) if "baseline" in file else None,
     )
+
+
+def _read_baseline(dataset: h5py.Dataset) -> NDArray[np.bool_]:
+    if not isinstance(dataset, h5py.Dataset) or dataset.dtype != bool or dataset.ndim != 1:
+        raise ValueError("baseline has not one axis of True and False")
+    return np.asarray(dataset[:])
 
 
 def _width(name: str, task: Task) -> int:

@@ -322,9 +322,8 @@ class Scene(Checked):
         time_step: float | None = None,
         void_density: float | None = None,
         void_stiffness: float | None = None,
-        coarsening: int = 1,
     ) -> Scene:
-        """The same scene and duration with another time step, other floors, or wider cells.
+        """The same scene and duration with another time step or other floors.
 
         Floors are those of all materials.
 
@@ -332,8 +331,6 @@ class Scene(Checked):
         ----------
         time_step, void_density, void_stiffness : float, optional
             As in `Scene` and `Material`.
-        coarsening : int, optional
-            How many of this scene's cells go into the width of a new one.
 
         Raises
         ------
@@ -363,15 +360,8 @@ class Scene(Checked):
                     f"Scene: duration {self.duration:g} is no multiple of time_step = "
                     f"{time_step:g}; the nearest that divides it is {self.duration / steps:.10g}"
                 )
-        coarsening = count("Scene", "coarsening", coarsening, 1)
-        if any(n % coarsening for n in self.grid.cells):
-            raise SceneError(
-                f"Scene: cells {self.grid.cells} are no multiples of coarsening = {coarsening}"
-            )
-        nx, ny = (n // coarsening for n in self.grid.cells)
-        grid = Grid((nx, ny), self.grid.dx * coarsening)
         return dataclasses.replace(
-            self, grid=grid, time_step=time_step, steps=steps, body=body, material=material
+            self, time_step=time_step, steps=steps, body=body, material=material
         )
 
     def to_json(self) -> str:
