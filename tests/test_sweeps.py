@@ -195,6 +195,23 @@ def test_sweep_is_a_name_of_the_package():
     assert Outcome({}).error == ""
 
 
+def test_an_interrupt_waits_until_the_executor_has_let_go_of_its_locks(store):
+    class Interrupted(ThreadPoolExecutor):
+        left: list[int] = []
+
+        def submit(self, *given):
+            signal.raise_signal(signal.SIGINT)
+            self.left.append(1)  # a lock, in the real one
+            return super().submit(*given)
+
+    with Interrupted(1) as executor:
+        with pytest.raises(KeyboardInterrupt):
+            sweep(square, points(3), store, executor)
+        assert sum(executor.left) == 3
+    with ThreadPoolExecutor(1) as executor:
+        assert squares(sweep(square, points(3), store, executor)) == {0: 0, 1: 1, 2: 4}
+
+
 # Processes of this machine.
 
 
@@ -347,8 +364,7 @@ def end_a_client(number, store, log, go, scheduler):
     ("where", "number"),
     [
         ("processes", signal.SIGKILL),
-        # Sometimes joblib's processes wait for ever on a busy machine; the cause is not found.
-        pytest.param("processes", signal.SIGINT, marks=pytest.mark.slow),
+        ("processes", signal.SIGINT),
         ("cluster", signal.SIGKILL),
     ],
 )

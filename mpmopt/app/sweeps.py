@@ -28,6 +28,7 @@ from typing import Any
 import numpy as np
 
 from mpmopt.errors import MissingLibraryError, SweepError
+from mpmopt.io.console import SIGNALS
 from mpmopt.io.files import locked
 from mpmopt.io.progress import Progress
 from mpmopt.results.sweepfile import Outcome, SweepFile
@@ -237,15 +238,18 @@ def _arrivals(
     futures: dict[Future[Answer], str] = {}
     try:
         while True:
-            for key in itertools.islice(waiting, most - len(futures)):
-                future = pool.submit(run, key)
-                futures[future] = key
-                future.add_done_callback(arrived.put)
+            with _signals_wait():
+                for key in itertools.islice(waiting, most - len(futures)):
+                    future = pool.submit(run, key)
+                    futures[future] = key
+                    future.add_done_callback(arrived.put)
             if not futures:
                 return
             batch = [arrived.get(), *(arrived.get() for _ in range(arrived.qsize()))]
-            lost = {future for future in batch if _is_lost(future)}
-            yield [(futures.pop(f), _answer(f)) for f in batch if f not in lost]
+            with _signals_wait():
+                lost = {future for future in batch if _is_lost(future)}
+                answers = [(futures.pop(f), _answer(f)) for f in batch if f not in lost]
+            yield answers
             for future in lost:
                 future.result()  # raises why
     except (BrokenExecutor, CancelledError, PicklingError, RuntimeError) as error:
@@ -259,6 +263,29 @@ def _arrivals(
             pool.shutdown(kill_workers=bool(futures))
         for future in futures:
             future.cancel()
+
+
+@contextmanager
+def _signals_wait() -> Iterator[None]:
+    """Signals are heard at the end.
+
+    An executor's locks are taken in Python: one that an exception leaves just then stays locked, and
+    those who wait for it wait for ever.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    heard: list[int] = []
+    handlers = {
+        number: signal.signal(number, lambda number, _: heard.append(number)) for number in SIGNALS
+    }
+    try:
+        yield
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+        for number in heard:
+            signal.raise_signal(number)
 
 
 def _is_lost(future: Future[Answer]) -> bool:
