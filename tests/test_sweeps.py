@@ -196,20 +196,19 @@ def test_sweep_is_a_name_of_the_package():
 
 
 def test_an_interrupt_waits_until_the_executor_has_let_go_of_its_locks(store):
+    left = []
+
     class Interrupted(ThreadPoolExecutor):
-        left: list[int] = []
-
-        def submit(self, *given):
+        def submit(self, fn, /, *args, **kwargs):
             signal.raise_signal(signal.SIGINT)
-            self.left.append(1)  # a lock, in the real one
-            return super().submit(*given)
+            left.append(1)  # a lock, in the real one
+            return super().submit(fn, *args, **kwargs)
 
-    with Interrupted(1) as executor:
-        with pytest.raises(KeyboardInterrupt):
-            sweep(square, points(3), store, executor)
-        assert sum(executor.left) == 3
-    with ThreadPoolExecutor(1) as executor:
-        assert squares(sweep(square, points(3), store, executor)) == {0: 0, 1: 1, 2: 4}
+    with Interrupted(1) as executor, pytest.raises(KeyboardInterrupt):
+        sweep(square, points(3), store, executor)
+    assert left == [1, 1, 1]
+    with ThreadPoolExecutor(1) as others:
+        assert squares(sweep(square, points(3), store, others)) == {0: 0, 1: 1, 2: 4}
 
 
 # Processes of this machine.

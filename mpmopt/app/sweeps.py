@@ -269,8 +269,8 @@ def _arrivals(
 def _signals_wait() -> Iterator[None]:
     """Signals are heard at the end.
 
-    An executor's locks are taken in Python: one that an exception leaves just then stays locked, and
-    those who wait for it wait for ever.
+    An executor's locks are taken in Python: one that an exception leaves just then stays locked,
+    and those who wait for it wait for ever.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
