@@ -616,39 +616,27 @@ def _log(x):
 LN2 = math.log(2.0)
 
 
-@overload(load)
-def _overload_load(array, k):
-    return lambda array, k: _load(array, k)
+def _compile_as(definition, operation):
+    """Compiled, a function of this module is an operation with the same arguments."""
+    overload(definition)(lambda *arguments: lambda *arguments: operation(*arguments))
 
 
-@overload(nothing)
-def _overload_nothing(array):
-    return lambda array: _nothing(array)
-
-
-@overload(store)
-def _overload_store(array, k, record):
-    return lambda array, k, record: _store(array, k, record)
-
-
-@overload(four)
-def _overload_four(array, place):
-    return lambda array, place: _four(array, place)
-
-
-@overload(put_four)
-def _overload_put_four(array, place, record):
-    return lambda array, place, record: _put_four(array, place, record)
-
-
-@overload(number)
-def _overload_number(array, k, lane):
-    return lambda array, k, lane: _number(array, k, lane)
-
-
-@overload(set_number)
-def _overload_set_number(array, k, lane, value):
-    return lambda array, k, lane, value: _set_number(array, k, lane, value)
+for _definition, _operation in (
+    (load, _load),
+    (nothing, _nothing),
+    (store, _store),
+    (four, _four),
+    (put_four, _put_four),
+    (number, _number),
+    (set_number, _set_number),
+    (real, _real),
+    (whole, _whole),
+    (least, _least),
+    (greatest, _greatest),
+    (chosen, _chosen),
+    (positive, _positive),
+):
+    _compile_as(_definition, _operation)
 
 
 @overload(pair)
@@ -666,16 +654,6 @@ def _overload_total(x):
     if x.lanes == 2:
         return lambda x: x[0] + x[1]
     return lambda x: (x[0] + x[1]) + (x[2] + x[3])
-
-
-@overload(real)
-def _overload_real(x):
-    return lambda x: _real(x)
-
-
-@overload(whole)
-def _overload_whole(x):
-    return lambda x: _whole(x)
 
 
 @overload(cell_coordinate)
@@ -704,29 +682,9 @@ def _overload_within(x, low, high):
     return lambda x, low, high: _within(x, _as(low, x), _as(high, x))
 
 
-@overload(least)
-def _overload_least(x, y):
-    return lambda x, y: _least(x, y)
-
-
-@overload(greatest)
-def _overload_greatest(x, y):
-    return lambda x, y: _greatest(x, y)
-
-
 @overload(above)
 def _overload_above(x, limit):
     return lambda x, limit: _above(x, _as(limit, real(x)))
-
-
-@overload(chosen)
-def _overload_chosen(which, x, y):
-    return lambda which, x, y: _chosen(which, x, y)
-
-
-@overload(positive)
-def _overload_positive(x):
-    return lambda x: _positive(x)
 
 
 @overload(reciprocal)

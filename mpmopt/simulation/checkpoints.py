@@ -11,7 +11,6 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Literal
 
 import h5py
@@ -22,7 +21,6 @@ from mpmopt.errors import DesignError, StorageError
 from mpmopt.validation import count, number
 
 MEGABYTE = 1_000_000
-FORMAT = "mpmopt checkpoints"
 
 
 @dataclass(frozen=True)
@@ -36,9 +34,9 @@ class Checkpointing:
         none.
     memory : int, optional
         Budget in bytes for states, store included unless it is on disk.
-    store : "memory", "disk" or Path, optional
-        Where checkpoints go: plain arrays, a scratch file (HDF5) in the system's temporary folder
-        that is removed at the end, or a file that is kept.
+    store : "memory" or "disk", optional
+        Where checkpoints go: plain arrays, or a scratch file (HDF5) in the system's temporary
+        folder.
 
     Raises
     ------
@@ -48,7 +46,7 @@ class Checkpointing:
 
     every: int | Literal["all"] | None = None
     memory: int = 256 * MEGABYTE
-    store: Path | Literal["memory", "disk"] | None = None
+    store: Literal["memory", "disk"] | None = None
 
     def __post_init__(self) -> None:
         name = "Checkpointing"
@@ -57,8 +55,8 @@ class Checkpointing:
             object.__setattr__(self, "every", every)
         memory = number(name, "memory", self.memory, above=0.0, error=DesignError)
         object.__setattr__(self, "memory", int(memory))
-        if self.store not in (None, "memory", "disk") and not isinstance(self.store, Path):
-            raise DesignError(f'{name}: store = {self.store!r} must be "memory", "disk" or a Path')
+        if self.store not in (None, "memory", "disk"):
+            raise DesignError(f'{name}: store = {self.store!r} must be "memory" or "disk"')
 
 
 @dataclass(frozen=True)
@@ -133,35 +131,29 @@ class Schedule:
 
 
 class Checkpoints:
-    """Room for arrays of every segment: in memory, or in an HDF5 file.
+    """Room for arrays of every segment: in memory, or in an HDF5 file that goes at the end.
 
-    The file is removed at the end unless it is to be kept. All its room is taken before the first
-    step: a disk that is full, or that fills up meanwhile, costs no computed step, and HDF5, which
-    does not survive it, never meets a write that fails.
+    All room of the file is taken before the first step: a disk that is full, or that fills up
+    meanwhile, costs no computed step, and HDF5, which does not survive it, never meets a write that
+    fails.
 
     Parameters
     ----------
     schedule : Schedule
     arrays : mapping of str to (shape, dtype)
         What is stored of each segment. Each dataset begins with an axis of the segments.
-    store : "memory", "disk", Path or None
-        As in `Checkpointing`; a Path is kept, once complete, and may replace an older store.
 
     Raises
     ------
     StorageError
-        If the file cannot be made, would replace a foreign one, or the disk has too little room.
+        If the file cannot be made, or memory or disk have too little room.
     """
 
     def __init__(
-        self,
-        schedule: Schedule,
-        arrays: Mapping[str, tuple[tuple[int, ...], DTypeLike]],
-        store: Path | Literal["memory", "disk"] | None = None,
+        self, schedule: Schedule, arrays: Mapping[str, tuple[tuple[int, ...], DTypeLike]]
     ) -> None:
         self.schedule = schedule
-        self._target = store if isinstance(store, Path) else None
-        self.path: Path | None = None
+        self._path: Path | None = None
         self._file: h5py.File | None = None
         self._store: dict[str, Any]  # arrays or datasets
         self._sums: dict[tuple[int, str], tuple[tuple[slice, ...], int]] = {}  # of a file's parts
@@ -177,57 +169,29 @@ class Checkpoints:
                     f"{error}; store fewer states (Checkpointing.every), or put them on disk"
                 ) from error
             return
-        if self._target is not None and self._target.exists() and not _is_store(self._target):
-            raise StorageError(
-                f"{self._target} exists and holds no checkpoints; choose another name"
-            )
         try:
-            folder = None if self._target is None else self._target.parent
-            handle, name = tempfile.mkstemp(prefix="mpmopt-", suffix=".h5", dir=folder)
+            handle, name = tempfile.mkstemp(prefix="mpmopt-", suffix=".h5")
             os.close(handle)
-            self.path = Path(name)
+            self._path = Path(name)
             sizes = (
                 np.dtype(dtype).itemsize * math.prod(shape) for shape, dtype in arrays.values()
             )
             size = len(schedule.segments) * sum(sizes) + MEGABYTE
-            self._take_room(size)  # twice, because HDF5 begins with an empty file
-            with h5py.File(self.path, "w") as file:
-                self._lay_out(file, arrays)
-            self._take_room(self.path.stat().st_size)
-            self._file = h5py.File(self.path, "r+")
+            _take_room(self._path, size)  # twice, because HDF5 begins with an empty file
+            with h5py.File(self._path, "w") as file:
+                _lay_out(file, len(schedule.segments), arrays)
+            _take_room(self._path, self._path.stat().st_size)
+            self._file = h5py.File(self._path, "r+")
             self._store = dict(self._file)
-            if self._target is None:
-                with suppress(OSError):  # some systems remove no open file
-                    self.path.unlink()  # nobody can touch it, and nothing is left if we are killed
+            with suppress(OSError):  # some systems remove no open file
+                self._path.unlink()  # nobody can touch it, and nothing is left if we are killed
         except OSError as error:
-            self._remove()
+            self.close()
             raise StorageError(
                 f"no room for checkpoints of {schedule.stored_bytes / MEGABYTE:.3g} MB in "
-                f"{self.path or folder}: {error}; store fewer states (Checkpointing.every), or put "
-                "them elsewhere (Checkpointing.store, or the environment variable TMPDIR)"
+                f"{tempfile.gettempdir()}: {error}; store fewer states (Checkpointing.every), or "
+                "put them elsewhere (the environment variable TMPDIR)"
             ) from error
-
-    def _lay_out(
-        self, file: h5py.File, arrays: Mapping[str, tuple[tuple[int, ...], DTypeLike]]
-    ) -> None:
-        file.attrs["format"] = FORMAT
-        segments = len(self.schedule.segments)
-        settings = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
-        settings.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
-        settings.set_fill_time(h5py.h5d.FILL_TIME_NEVER)
-        for name, (shape, dtype) in arrays.items():
-            space = h5py.h5s.create_simple((segments, *shape))
-            kind = h5py.h5t.py_create(np.dtype(dtype))
-            h5py.h5d.create(file.id, name.encode(), kind, space, dcpl=settings)
-
-    def _take_room(self, size: int) -> None:
-        assert self.path is not None
-        with self.path.open("ab") as file:
-            free = shutil.disk_usage(self.path.parent).free
-            if free < size:
-                raise OSError(f"{size / MEGABYTE:.3g} MB needed, {free / MEGABYTE:.3g} MB free")
-            if hasattr(os, "posix_fallocate"):
-                os.posix_fallocate(file.fileno(), 0, size)
 
     def write(self, segment: int, **arrays: NDArray) -> None:
         """Store named arrays of a segment; they may be shorter than the room for them."""
@@ -256,55 +220,44 @@ class Checkpoints:
             return array
         except (OSError, KeyError, RuntimeError) as error:
             raise StorageError(
-                f"cannot read {name} of segment {segment} back from {self.path or 'memory'}: "
+                f"cannot read {name} of segment {segment} back from the store: "
                 f"{error}; run again, with the file out of other programs' reach"
             ) from error
 
     def close(self) -> None:
-        """Close the store; move it to the place that was asked for, or remove it.
-
-        Raises
-        ------
-        StorageError
-            If it cannot be moved there.
-        """
+        """Close the store and remove its file."""
         if self._file is not None:
             self._file.close()
-        if self.path is not None and self._target is not None:
-            try:
-                os.replace(self.path, self._target)
-            except OSError as error:
-                self._remove()
-                raise StorageError(f"cannot keep checkpoints as {self._target}: {error}") from error
-        self._remove()
-
-    def _remove(self) -> None:
-        if self.path is not None:
-            self.path.unlink(missing_ok=True)
+        if self._path is not None:
+            self._path.unlink(missing_ok=True)
 
     def __enter__(self) -> Checkpoints:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        if kind is not None:
-            self._target = None  # incomplete
+    def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def _lay_out(
+    file: h5py.File, segments: int, arrays: Mapping[str, tuple[tuple[int, ...], DTypeLike]]
+) -> None:
+    settings = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+    settings.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
+    settings.set_fill_time(h5py.h5d.FILL_TIME_NEVER)
+    for name, (shape, dtype) in arrays.items():
+        space = h5py.h5s.create_simple((segments, *shape))
+        kind = h5py.h5t.py_create(np.dtype(dtype))
+        h5py.h5d.create(file.id, name.encode(), kind, space, dcpl=settings)
+
+
+def _take_room(path: Path, size: int) -> None:
+    with path.open("ab") as file:
+        free = shutil.disk_usage(path.parent).free
+        if free < size:
+            raise OSError(f"{size / MEGABYTE:.3g} MB needed, {free / MEGABYTE:.3g} MB free")
+        if hasattr(os, "posix_fallocate"):
+            os.posix_fallocate(file.fileno(), 0, size)
 
 
 def _checksum(array: NDArray) -> int:
     return zlib.crc32(np.ascontiguousarray(array).data)
-
-
-def _is_store(path: Path) -> bool:
-    """Whether a file holds checkpoints of an earlier run."""
-    try:
-        with h5py.File(path, "r") as file:
-            found = file.attrs.get("format")
-            return isinstance(found, str) and found == FORMAT
-    except OSError:
-        return False

@@ -330,7 +330,7 @@ class LagrangianSimulation(Simulation):
         arrays: dict[str, tuple[tuple[int, ...], DTypeLike]] = {"state": (self.start.shape, dtype)}
         if schedule.all_stored:
             arrays = {"states": ((schedule.segment + 1, *self.start.shape), dtype)}
-        return Checkpoints(schedule, arrays, wish.store)
+        return Checkpoints(schedule, arrays)
 
     def forward(
         self,

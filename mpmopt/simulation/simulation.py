@@ -343,7 +343,7 @@ class Simulation:
                 "windows": ((length, len(self.data.first), 4), np.int64),
                 "logs": ((length, *log), dtype),
             }
-        return Checkpoints(schedule, arrays, wish.store)
+        return Checkpoints(schedule, arrays)
 
     def forward(
         self,
