@@ -216,7 +216,7 @@ def test_the_command_prints_the_summary_or_an_error(tmp_path, capsys):
     run = runfile.read_run(tmp_path / "run.h5").run
     assert run.origin == pytest.approx(13 / 64)
     assert f"evaluation {run.chosen} of 2, stage 1 of 1, beta 0.5" in printed[3]
-    assert printed[5].endswith("report.html, history.png, design.png, summary.json, run.h5")
+    assert printed[5].endswith("report.html, run.h5, summary.json, design.png, history.png")
     assert shlex.split(printed[6].removeprefix("next"))[:4] == [
         sys.executable,
         "-m",

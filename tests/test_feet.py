@@ -52,6 +52,17 @@ def test_what_never_touches_or_is_void_is_no_foot():
     assert feet(moving([(1.5, 1.5, 1.5, 1.5)])) == []
 
 
+def test_a_foot_stands_where_it_bears_a_tenth_of_the_largest_load():
+    # Loads of one foot 0.4 + 0.4, 0.04 + 0.05, 0.06 + 0.04; of the other nothing, 0.2, 0.
+    motion = moving([(0.6, 0.6, 1.5, 1.5), (0.96, 0.95, 0.8, 1.5), (0.94, 0.95, 1.5, 1.5)])
+    one, other = feet(motion)
+    assert one.load == pytest.approx([0.8, 0.09, 0.11], abs=1e-5)
+    assert one.stands.tolist() == [True, True, True]
+    assert other.stands.tolist() == [False, True, False]
+    lighter = moving([(0.6, 0.6, 1.5, 1.5), (0.97, 0.96, 0.9, 1.5), (0.94, 0.95, 1.5, 1.5)])
+    assert feet(lighter)[0].stands.tolist() == [True, False, True]
+
+
 @pytest.mark.parametrize("axis", ["x", "y"])
 def test_feet_of_a_channel_are_those_of_the_simulated_half(axis):
     scene = dataclasses.replace(channel(axis), steps=20)

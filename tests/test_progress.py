@@ -94,6 +94,27 @@ def test_on_a_terminal_there_is_a_bar_and_results_stay_whole():
     assert "of 20 steps" not in said
 
 
+GOING_ON = """
+import time
+from mpmopt.io.progress import Progress
+with Progress("steps", 1000) as progress:
+    progress.count = 900
+    for k in range(20):
+        progress.step()
+        time.sleep(0.05)
+"""
+
+
+@pytest.mark.process
+@needs_terminal
+def test_the_time_that_is_left_is_that_of_what_is_done_now():
+    _, _, said = on_a_terminal(GOING_ON)
+    last = said.split("\r")[-3]
+    assert "/1000 " in last
+    minutes, seconds = last.split("<")[1].split(",")[0].split(":")
+    assert 2 <= 60 * int(minutes) + int(seconds) <= 20  # 80 steps of 0.05 s
+
+
 LOGS = """
 import logging, sys, time, warnings
 from mpmopt.errors import StorageError

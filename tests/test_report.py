@@ -16,7 +16,8 @@ from PIL import Image
 from mpmopt.__main__ import main
 from mpmopt.assess.trajectory import Motion, optimised, post_processed
 from mpmopt.design.problem import Problem
-from mpmopt.design.task import Task
+from mpmopt.design.task import AtMost, Task
+from mpmopt.design.terms import Effort, Volume
 from mpmopt.design.variation import Variation
 from mpmopt.errors import DesignError, SimulationError
 from mpmopt.results import runfile
@@ -147,6 +148,19 @@ def test_a_body_that_cannot_be_simulated_is_left_out(
     assert "without a body: step 3, body: it burst" in caplog.text
 
 
+def test_each_constraint_is_told_with_value_bound_and_multiplier(short_run, short_path, tmp_path):
+    task = Task(subject_to=(AtMost(Volume(), 0.4), AtMost(Effort(), 0.5)))
+    best = dataclasses.replace(
+        short_run.result, constraints=(0.3, 0.7), multipliers=(0.0, 0.125), violation=0.4
+    )
+    run = dataclasses.replace(short_run, task=task, best={0: best})
+    report(tmp_path / "a.html", run, {}, {}, short_path)
+    assert data_of(tmp_path / "a.html")["tables"]["constraints"] == [
+        {"name": "Volume()", "value": 0.3, "bound": 0.4, "multiplier": 0.0, "met": True},
+        {"name": "Effort()", "value": 0.7, "bound": 0.5, "multiplier": 0.125, "met": False},
+    ]
+
+
 def test_the_design_is_filmed_in_each_scene_of_an_ensemble(short_run, short_path, tmp_path):
     task = Task(scenes=(Variation(strength=0.5), Variation(refinement=2)))
     history = [dataclasses.replace(item, scenes=(0.4, 0.5)) for item in short_run.history]
@@ -224,7 +238,7 @@ def test_the_page_works_in_a_real_browser(page, tmp_path):
         assert look.startswith("Evaluation 2 of 2, the chosen one")
         assert browser.js("document.querySelector('#look img').naturalWidth") == 8
         text = browser.js("document.body.innerText")
-        for name in ("speed by friction", "thinnest member", "components", SUMMARY["odd"]):
+        for name in ("speed by friction", "thinnest member", "pieces", SUMMARY["odd"]):
             assert name in text
 
         shots = []

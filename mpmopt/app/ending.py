@@ -94,5 +94,5 @@ def _pieces(summary: Mapping[str, Any]) -> str:
 
 
 def _files(path: Path) -> list[str]:
-    there = [name for name in reversed(RESULTS) if (path.parent / name).exists()]
-    return [*there, path.name]
+    names = "report.html", path.name, *RESULTS
+    return [name for name in dict.fromkeys(names) if (path.parent / name).exists()]

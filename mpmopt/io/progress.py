@@ -60,6 +60,8 @@ class Progress:
 
     def step(self, text: str = "") -> None:
         """One step more is done; `text` says what it gave."""
+        if self._bar.n == 0:  # what was done before took its time before
+            self._bar.initial = self._bar.last_print_n = self.count
         self._bar.n, self._bar.total = self.count, self.total
         self.count += 1
         self._bar.set_postfix_str(text, refresh=False)

@@ -36,6 +36,7 @@ from mpmopt.assess.trajectory import (
     solid,
 )
 from mpmopt.design.problem import Problem
+from mpmopt.design.task import FEASIBLE
 from mpmopt.errors import SimulationError
 from mpmopt.io.console import command
 from mpmopt.io.files import replace_file
@@ -312,7 +313,7 @@ def _tables(
                 "value": value,
                 "bound": constraint.bound,
                 "multiplier": multiplier,
-                "met": bool(run.task.violation(result.constraints) == 0.0),
+                "met": bool(constraint.g(value) <= FEASIBLE),
             }
             for constraint, value, multiplier in rows
         ],
