@@ -2,6 +2,7 @@
 
 examples:
   python cases/walker.py --preview --out out/walker    make a run
+  mpmopt report out/walker/run.h5                      one page of all that it found
   mpmopt plot out/walker/run.h5                        pictures of it
   mpmopt film out/walker/run.h5                        and a film
   mpmopt verify out/walker/run.h5                      are its gradients right?
@@ -54,6 +55,20 @@ def plot(path: Path, out: Path | None, force: bool) -> int:
             progress.print(str(picture))
 
         plot_run(folder, run, written)
+    return 0
+
+
+def report(path: Path, out: Path | None, force: bool) -> int:
+    """Write a run's report: one HTML file with film, gait, history, designs and numbers."""
+    from mpmopt.io.files import make_folder, refuse_existing
+    from mpmopt.view.report import report as reported_on
+
+    found = _read(path)
+    target = out or path.parent / "report.html"
+    refuse_existing([target] if out else (), force)
+    make_folder(target.parent)
+    reported_on(target, found.run, found.summary, found.versions, path)
+    print(f"{target}: {target.stat().st_size / 1e6:.2g} MB")
     return 0
 
 
@@ -214,6 +229,22 @@ def forces(path: Path, out: Path | None, force: bool) -> int:
     return 0
 
 
+def trajectory(path: Path, out: Path | None, force: bool) -> int:
+    """Write how a run's best design moves, without grey, as comma-separated values."""
+    from mpmopt.assess.trajectory import post_processed
+    from mpmopt.io.files import make_folder, refuse_existing, replace_file
+    from mpmopt.results.trajectory import table
+
+    run = _read(path).run
+    target = out or path.parent / "trajectory.csv"
+    refuse_existing([target] if out else (), force)
+    text = table(post_processed(run.problem(), run.result.x))
+    make_folder(target.parent)
+    replace_file(target, text.encode())
+    print(f"{target}: {len(text.splitlines()) - 1} instants")
+    return 0
+
+
 def cheapest(path: Path, tol: float, gradient_tol: float | None, seconds: float) -> int:
     """Print the cheapest discretisation that tells a run's best design as well as the finest."""
     from mpmopt.assess import discretisation
@@ -250,23 +281,25 @@ def cheapest(path: Path, tol: float, gradient_tol: float | None, seconds: float)
 
 
 def resume(path: Path) -> int:
-    """Go on with a run that was stopped, and print its summary."""
+    """Go on with a run that was stopped, and print what it found."""
     from mpmopt.app.case import resume as resumed
-    from mpmopt.app.summary import table
+    from mpmopt.app.ending import ending
 
-    print(table(resumed(path)))
+    resumed(path)
+    print(ending(path))
     return 0
 
 
 def export(path: Path, out: Path | None, force: bool, **options: Any) -> int:
     """Write a run's best design as files that other programs read; 1 if one cannot be written."""
     from mpmopt.io.files import refuse_existing
-    from mpmopt.results.export import FILES, size
     from mpmopt.results.export import export as exported
+    from mpmopt.results.export import files, ours, size
 
     run = _read(path).run
     folder = out or path.parent
-    refuse_existing((folder / FILES[name] for name in options["formats"] if out), force)
+    there = [folder / name for name in files(options["formats"], options["parts"])]
+    refuse_existing((file for file in there if out and not ours(file)), force)
     done = exported(run.problem(), run.result.x, folder, **options)
     for file in done.paths:
         print(f"{file}  {file.stat().st_size} bytes")
@@ -326,6 +359,18 @@ def _parser() -> argparse.ArgumentParser:
         "out/walker/run.h5",
     )
     command.set_defaults(do=resume, advice=how_to_go_on)
+
+    command = add(
+        "report",
+        "write a page of its film, gait, history, designs and numbers",
+        "Write report.html, a single file that any browser opens without a network: the best\n"
+        "design in motion, its gait, the history, the designs, its robustness, the constraints,\n"
+        "all settings, and how to reproduce it.",
+        "out/walker/run.h5",
+        "out/walker/run.h5 --out walker.html",
+    )
+    add_place(command, "FILE", "HTML file (default: report.html there)")
+    command.set_defaults(do=report)
 
     command = add(
         "plot",
@@ -415,6 +460,18 @@ def _parser() -> argparse.ArgumentParser:
     command.set_defaults(do=forces)
 
     command = add(
+        "trajectory",
+        "write how its best design moves as a table",
+        "Write trajectory.csv, of the best design without void, in the scene's units: time, place\n"
+        "and velocity of the centroid, travel, the actuators' signals, and for each foot its\n"
+        "height and whether it stands.",
+        "out/walker/run.h5",
+        "out/walker/run.h5 --out walker.csv",
+    )
+    add_place(command, "FILE", "CSV file (default: trajectory.csv there)")
+    command.set_defaults(do=trajectory)
+
+    command = add(
         "cheapest",
         "find the cheapest discretisation that is accurate enough",
         "Measure the best design in one discretisation after the other, from the cheapest on,\n"
@@ -434,21 +491,28 @@ def _parser() -> argparse.ArgumentParser:
     command = add(
         "export",
         "write its design as drawing, solid and motion",
-        "Write the best design without grey: design.svg, design.dxf and design.stl at a size in\n"
-        "millimetres, motion.vtkhdf in the scene's units. DXF and STL need pip install\n"
-        "'mpmopt[export]'.",
+        "Write the best design without grey: design.svg, design.dxf, design.stl and design.3mf at\n"
+        "a size in millimetres, motion.vtkhdf in the scene's units. All but SVG and the motion\n"
+        "need pip install 'mpmopt[export]'.",
         "out/walker/run.h5 --svg --dxf --stl --vtk --width 60",
         "out/walker/run.h5 --stl --scale 200 --thickness 8 --drop-components --out parts",
+        "out/walker/run.h5 --stl --svg --parts --width 60 --out molds",
     )
     for name, text in (
         ("svg", "write a drawing"),
         ("dxf", "write a drawing for CAD"),
         ("stl", "write a watertight solid"),
+        ("3mf", "write the same for printers that know several materials"),
         ("vtk", "write the motion, for ParaView"),
     ):
         command.add_argument(
             f"--{name}", dest="formats", action="append_const", const=name, default=[], help=text
         )
+    command.add_argument(
+        "--parts",
+        action="store_true",
+        help="actuators and passive body apart: layers, objects, a file of each as STL",
+    )
     command.add_argument("--width", type=float, metavar="MM", help="width of the drawing or solid")
     command.add_argument(
         "--scale", type=float, metavar="MM", help="instead: length of the scene's unit"

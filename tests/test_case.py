@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+import shlex
 import shutil
 import subprocess
 import sys
@@ -14,7 +15,7 @@ import numpy as np
 import pytest
 from walker import CASES, slanted_legs, walker
 
-from mpmopt.app.case import START, Case, ProgressBar, resume, run
+from mpmopt.app.case import START, Case, ProgressBar, most_evaluations, resume, run
 from mpmopt.app.script import main
 from mpmopt.assess.threshold import pieces
 from mpmopt.design.problem import Problem
@@ -102,7 +103,7 @@ def test_a_small_climber_climbs_even_without_its_void(tmp_path):
 def test_the_folder_holds_run_summary_and_pictures(folder):
     out, summary = folder
     names = {path.name for path in out.iterdir()}
-    assert names == {"run.h5", "summary.json", "design.png", "history.png"}
+    assert names == {"run.h5", "summary.json", "design.png", "history.png", "report.html"}
     assert json.loads((out / "summary.json").read_text()) == summary
     assert set(summary) >= {
         "start", "reference", "baseline", "optimised", "post_processed", "a", "theta", "b",
@@ -194,7 +195,7 @@ def test_a_linked_run_is_written_where_the_link_leads(tmp_path):
     (there / "design.png").unlink()
     assert run(TINY, here) == resume(here / "run.h5")
     assert [path.name for path in here.iterdir()] == ["run.h5"]
-    assert len(list(there.iterdir())) == 4
+    assert len(list(there.iterdir())) == 5
     assert (here / "run.h5").is_symlink()
 
 
@@ -208,8 +209,19 @@ def test_the_command_prints_the_summary_or_an_error(tmp_path, capsys):
     cases = {"default": SMALL, "tiny": TINY}
     assert main("A case.", cases, ["--tiny", "--out", str(tmp_path)]) == 0
     printed = capsys.readouterr().out.splitlines()
-    assert printed[0].split() == ["start", "0.2031"]
-    assert printed[-1].startswith("stop reason  ")
+    words = ["displacement", "gain", "pieces", "chosen", "stopped", "files", "next"]
+    assert [line.split()[0] for line in printed] == words
+    assert all(len(line.split("  ")[0]) <= len("displacement") for line in printed)
+    run = runfile.read_run(tmp_path / "run.h5").run
+    assert run.origin == pytest.approx(13 / 64)
+    assert f"evaluation {run.chosen} of 2, stage 1 of 1, beta 0.5" in printed[3]
+    assert printed[5].endswith("report.html, history.png, design.png, summary.json, run.h5")
+    assert shlex.split(printed[6].removeprefix("next"))[:4] == [
+        sys.executable,
+        "-m",
+        "mpmopt",
+        "film",
+    ]
     assert main("A case.", cases, ["--out", str(tmp_path)]) == 1
     assert capsys.readouterr().err.startswith("StorageError: ")
 
@@ -220,8 +232,23 @@ def test_progress_becomes_log_lines_off_a_terminal(capsys):
     start = Problem(scene).join(0.0, 1.0, -0.3, -0.5)
     optimise(scene, settings, start, [ProgressBar()])
     lines = capsys.readouterr().err.splitlines()
-    assert [line.split()[0] for line in lines] == ["10", "20"]
-    assert "non-discreteness" in lines[0]
+    assert [line.split(",")[0] for line in lines] == [
+        "10 of 20 evaluations",
+        "20 of 20 evaluations",
+    ]
+    assert "displacement" in lines[0] and "non-discreteness" in lines[0]
+
+
+def test_the_number_of_evaluations_is_known_from_the_stages(short_run):
+    stages = SMALL.settings.stages
+    stages = (*stages, dataclasses.replace(stages[1], most_iterations=7))
+    settings = Settings(stages, least_iterations=5, most_iterations=20)
+    first = short_run.history[0]
+    history = [first, dataclasses.replace(first, failure="torn")]
+    begun = dataclasses.replace(short_run, stage=0, settings=settings, history=history)
+    assert most_evaluations(begun) == 2 + 19 + 20 + 7  # what failed is done again
+    early = dataclasses.replace(begun, stage=1, history=[first] * 9)
+    assert most_evaluations(early) == 9 + 20 + 7
 
 
 def test_the_walkers_settings_are_those_of_the_design():

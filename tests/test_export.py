@@ -3,8 +3,10 @@
 import dataclasses
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -288,6 +290,116 @@ def test_what_meets_in_corners_is_parted(mirror, designed, tmp_path):
     assert designed or touching >= 3
 
 
+@pytest.fixture(scope="module")
+def driven():
+    """A crawler whose actuator lies in the middle of a design with a hole beside it."""
+    problem = Problem(crawler(64, 8e-4), beta=8.0)
+    position = problem.particles.position[problem.particles.designed]
+    phi = np.where(np.hypot(*(position * 64 - (29, 30)).T) < 1.6, -1.0, 1.0)
+    return problem, problem.join(phi, 1.0, 0.0, 0.0)
+
+
+def test_actuators_and_passive_body_are_drawn_apart_and_fill_the_body_together(driven):
+    problem, x = driven
+    whole, passive, actuator = (
+        outline(problem, x, part=part) for part in ("body", "passive", "actuator")
+    )
+    (square,) = actuator
+    wanted = np.array([(26, 29), (26, 35), (20, 35), (20, 29)]) / 64
+    assert square.rings[0] == pytest.approx(wanted[_order(square.rings[0])], abs=1e-12)
+    areas = [sum(polygon.area for polygon in part) for part in (whole, passive, actuator)]
+    assert areas[0] == pytest.approx(areas[1] + areas[2], rel=1e-9)
+    assert [len(polygon.rings) for polygon in whole] == [3]
+    assert [len(polygon.rings) for polygon in passive] == [4]  # and one for the actuator
+
+
+def test_parts_are_layers_of_drawings(driven, tmp_path):
+    problem, x = driven
+    done = export(problem, x, tmp_path, ["svg", "dxf"], width=20.0, parts=True)
+    assert [path.name for path in done.paths] == ["design.svg", "design.dxf"]
+    image = svgelements.SVG.parse(str(tmp_path / "design.svg"), ppi=25.4)
+    groups = [each for each in image if isinstance(each, svgelements.Group)]
+    assert [group.id for group in groups] == ["passive", "actuator"]
+    box = groups[1].bbox()
+    assert box == pytest.approx((7.0, 3.0, 13.0, 9.0), abs=1e-4)  # one cell is 1 mm
+    assert groups[0].bbox() == pytest.approx((0.0, 0.0, 20.0, 12.0), abs=1e-4)
+    with (tmp_path / "design.dxf").open("rb") as file:
+        drawing = trimesh.load_path(file, file_type="dxf")
+    layers = [str(entity.layer).lower() for entity in drawing.entities]
+    assert sorted(layers) == ["actuator", "passive", *3 * ["passive_holes"]]
+
+
+def test_parts_are_solids_that_touch_and_nowhere_overlap(driven, tmp_path):
+    problem, x = driven
+    export(problem, x, tmp_path, ["stl", "3mf"], width=20.0, thickness=3.0, parts=True)
+    names = {path.name for path in tmp_path.iterdir()}
+    assert names == {"design_passive.stl", "design_actuator.stl", "design.3mf"}
+    passive, actuator = (
+        trimesh.load_mesh(str(tmp_path / f"design_{part}.stl")) for part in ("passive", "actuator")
+    )
+    assert passive.is_watertight and actuator.is_watertight
+    assert actuator.volume == pytest.approx(6 * 6 * 3.0, rel=1e-5)
+    assert actuator.bounds == pytest.approx(np.array([(7, 3, 0), (13, 9, 3)]), abs=1e-5)
+    export(problem, x, tmp_path, ["stl"], width=20.0, thickness=3.0)
+    whole = trimesh.load_mesh(str(tmp_path / "design.stl"))
+    assert whole.volume == pytest.approx(passive.volume + actuator.volume, rel=1e-5)
+    solids = objects_of(tmp_path / "design.3mf")
+    for (name, mesh), other in zip(solids.items(), (passive, actuator), strict=True):
+        assert name in ("passive", "actuator")
+        assert mesh.is_watertight
+        assert mesh.volume == pytest.approx(other.volume, rel=1e-5)
+        assert mesh.bounds == pytest.approx(other.bounds, abs=1e-4)
+
+
+def objects_of(path):
+    """The solids of a 3MF file by name, and what its specification asks of the package."""
+    space = {"m": "http://schemas.microsoft.com/3dmanufacturing/core/2015/02"}
+    with zipfile.ZipFile(path) as package:
+        assert package.testzip() is None
+        assert package.namelist()[0] == "[Content_Types].xml"
+        links = ElementTree.fromstring(package.read("_rels/.rels"))
+        model = ElementTree.fromstring(package.read(links[0].attrib["Target"].lstrip("/")))
+    assert model.attrib["unit"] == "millimeter"
+    items = [item.attrib["objectid"] for item in model.iterfind("m:build/m:item", space)]
+    colours = model.findall("m:resources/m:basematerials/m:base", space)
+    found: dict[str, Any] = {}
+    for each in model.iterfind("m:resources/m:object", space):
+        assert each.attrib["id"] == items[len(found)]
+        assert colours[int(each.attrib["pindex"])].attrib["name"] == each.attrib["name"]
+        vertices = [
+            [float(vertex.attrib[k]) for k in "xyz"]
+            for vertex in each.iterfind(".//m:vertex", space)
+        ]
+        triangles = [
+            [int(face.attrib[f"v{k}"]) for k in (1, 2, 3)]
+            for face in each.iterfind(".//m:triangle", space)
+        ]
+        found[each.attrib["name"]] = trimesh.Trimesh(vertices, triangles)
+    return found
+
+
+@pytest.mark.parametrize("name", ["svg", "dxf", "stl", "3mf", "vtk"])
+def test_what_was_exported_is_known_again_and_what_others_made_is_not(holed, tmp_path, name):
+    width = None if name == "vtk" else 60.0
+    problem, x = holed
+    (path,) = export(problem, x, tmp_path, [name], width=width).paths
+    assert exporting.ours(path)
+    (tmp_path / "link").symlink_to(path)
+    (tmp_path / "other.svg").write_text("<svg></svg>")
+    for file in ("link", "other.svg", "nothing"):
+        assert not exporting.ours(tmp_path / file)
+
+
+def test_the_command_replaces_its_own_files_and_no_others(holed, tmp_path, capsys):
+    path, out = run_file(tmp_path / "run.h5", *holed), tmp_path / "out"
+    words = ["export", str(path), "--svg", "--stl", "--width", "60", "--out", str(out)]
+    assert main(words) == main(words) == 0
+    (out / "design.stl").write_text("somebody's")
+    assert main(words) == 1
+    assert "design.stl is there already" in capsys.readouterr().err
+    assert (out / "design.stl").read_text() == "somebody's"
+
+
 def test_of_a_mirror_scene_the_whole_body_is_exported(tmp_path):
     half = crawler(64, 8e-4)
     rng = np.random.default_rng(1)
@@ -398,7 +510,7 @@ def test_of_a_mirror_scene_all_loose_particles_are_counted(tmp_path):
 @pytest.mark.parametrize(
     ("formats", "options", "what"),
     [
-        ([], {"width": 60.0}, "ask for some of svg, dxf, stl, vtk"),
+        ([], {"width": 60.0}, "ask for some of svg, dxf, stl, 3mf, vtk"),
         (["step"], {"width": 60.0}, "unknown"),
         (["svg"], {}, "width in mm, or a scale"),
         (["svg"], {"width": 60.0, "scale": 80.0}, "one of them"),
@@ -413,6 +525,8 @@ def test_of_a_mirror_scene_all_loose_particles_are_counted(tmp_path):
         (["vtk"], {"width": 60.0}, "ask for svg, dxf or stl too"),
         (["vtk"], {"scale": 80.0}, "neither width nor scale"),
         (["svg", "dxf", "vtk"], {"width": 60.0, "thickness": 3.0}, "ask for stl too"),
+        (["vtk"], {"parts": True}, "the motion has no parts"),
+        (["svg"], {"width": 60.0, "parts": True}, "no actuator"),
     ],
 )
 def test_sizes_that_make_no_sense_are_refused_and_nothing_is_written(

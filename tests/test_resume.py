@@ -101,7 +101,10 @@ def test_a_signal_ends_a_run_with_its_code_and_says_how_to_go_on(whole, tmp_path
     assert process.wait_for("reverse")
     found, text = process.end(number)
     assert found == code
-    assert f"{number.name}. Every evaluation is saved; go on with: python -m mpmopt resume" in text
+    assert (
+        f"{number.name}. Every evaluation is saved; go on with: {sys.executable} -m mpmopt resume"
+        in text
+    )
     assert "Traceback" not in text
     assert faults.resumed(tmp_path / "out") == whole
 
@@ -157,7 +160,7 @@ def test_a_signal_ends_going_on_too_and_says_how_to_go_on(whole, tmp_path):
     going_on.send_signal(signal.SIGTERM)
     _, text = going_on.communicate(timeout=50)
     assert going_on.returncode == 143
-    assert f"go on with: python -m mpmopt resume {file}\n" in text
+    assert f"go on with: {sys.executable} -m mpmopt resume {file}\n" in text
     assert faults.resumed(tmp_path / "out") == whole
 
 

@@ -12,6 +12,7 @@ from conftest import SHORT, empty, small_scene
 from mpmopt.app.study import full_study
 from mpmopt.app.summary import table
 from mpmopt.assess import robustness
+from mpmopt.assess.feet import feet
 from mpmopt.assess.robustness import (
     FRICTIONS,
     Robot,
@@ -34,7 +35,7 @@ from mpmopt.optimisation.loop import optimise
 from mpmopt.results import runfile
 from mpmopt.scene import Actuator, Design, Grid, Ground, Material, Mirror, Scene, Solid
 from mpmopt.view import gait
-from mpmopt.view.gait import feet, plot_robustness
+from mpmopt.view.gait import plot_robustness
 
 C = 1 / 16
 

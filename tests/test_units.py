@@ -160,7 +160,7 @@ def test_what_is_printed_of_a_small_robot_has_digits(tmp_path, capsys):
     # Half a millimetre long, in metres.
     summary = finished(tmp_path / "run.h5", scaled(small_scene(steps=20), 2e-3, 1.0, 1.0))
     (progress,) = capsys.readouterr().err.splitlines()
-    are_told(re.findall(r"L ([^,]+),", progress)[0], 1)
+    are_told(re.findall(r"displacement ([^,]+),", progress)[0], 1)
     lengths = {name: summary[name] for name in ("start", "reference", "optimised", "gain")}
     are_told(table(lengths), 7)
     kept = runfile.read_run(tmp_path / "run.h5").run

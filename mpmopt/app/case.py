@@ -34,7 +34,8 @@ logger = logging.getLogger(__name__)
 
 # Besides run.h5; the last three of robots on ground.
 RESULTS = (
-    "summary.json", "design.png", "history.png", "stride.png", "gait.png", "robustness.png",
+    "summary.json", "report.html", "design.png", "history.png",
+    "stride.png", "gait.png", "robustness.png",
 )  # fmt: skip
 START = {"phi": 0.0, "a": 1.0, "theta": -0.3, "b": -0.5}
 
@@ -89,18 +90,30 @@ class ProgressBar:
     """Callback of `optimise` that shows how far it is; log lines off a terminal."""
 
     def __init__(self) -> None:
-        self._progress = Progress("gradients")
+        self._progress = Progress("evaluations")
+        self._origin: float | None = None
 
     def __call__(self, run: Optimisation) -> None:
-        self._progress.count = len(run.history) - 1
         if run.stop_reason:
             self._progress.close()
             return
+        if self._origin is None:
+            self._origin = run.origin
         last = run.history[-1]
+        self._progress.count = len(run.history) - 1
+        self._progress.total = most_evaluations(run)
         self._progress.step(
-            f"L {digits(last.objective)}, beta {last.beta:g}, "
-            f"non-discreteness {last.non_discreteness:.3f}"
+            f"{run.measure} {digits(last.objective - self._origin, 3)}, beta {last.beta:g}, "
+            f"non-discreteness {last.non_discreteness:.2f}"
         )
+
+
+def most_evaluations(run: Optimisation) -> int:
+    """How many evaluations a run will have had if no stage ends early from now on."""
+    settings, now = run.settings, run.stage
+    limits = [stage.most_iterations or settings.most_iterations for stage in settings.stages]
+    done = sum(item.stage == now and not item.failure for item in run.history)
+    return len(run.history) + max(limits[now] - done, 0) + sum(limits[now + 1 :])
 
 
 def run(
@@ -114,8 +127,8 @@ def run(
     """Optimise a case and leave its results in a folder.
 
     Writes ``run.h5`` (before the first and after every evaluation), ``summary.json``,
-    ``design.png`` and ``history.png``; of a robot on ground also ``stride.png``, ``gait.png`` and
-    ``robustness.png``. A folder that holds an unfinished run of this case is gone
+    ``report.html``, ``design.png`` and ``history.png``; of a robot on ground also ``stride.png``,
+    ``gait.png`` and ``robustness.png``. A folder that holds an unfinished run of this case is gone
     on with; one that holds a finished one is left as it is.
 
     Parameters
@@ -251,20 +264,23 @@ def _go_on(
     text = json.dumps(summary, indent=1) + "\n"
     replace_file(path.parent / "summary.json", text.encode())
     runfile.write(path, result, summary, kept.baseline)
-    drawn = RESULTS[1:] if "speed" in summary else RESULTS[1:3]
+    drawn = RESULTS[1:] if "speed" in summary else RESULTS[1:4]
     for name in drawn:
-        draw_or_warn(path.parent / name, lambda picture: _draw(picture, result, summary))
+        draw_or_warn(path.parent / name, lambda target: _draw(target, result, summary, path))
     return summary
 
 
-def _draw(path: Path, result: Optimisation, summary: Mapping[str, Any]) -> None:
+def _draw(target: Path, result: Optimisation, summary: Mapping[str, Any], source: Path) -> None:
     from mpmopt.view.gait import plot_robustness
     from mpmopt.view.plot import PICTURES
+    from mpmopt.view.report import report
 
-    if path.name == "robustness.png":
-        plot_robustness(path, summary)
+    if target.suffix == ".html":
+        report(target, result, summary, runfile.versions(), source)
+    elif target.name == "robustness.png":
+        plot_robustness(target, summary)
     else:
-        PICTURES[path.stem](path, result)
+        PICTURES[target.stem](target, result)
 
 
 def draw_or_warn(path: Path, draw: Callable[[Path], None]) -> None:

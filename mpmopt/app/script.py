@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from mpmopt.app.case import Case, run
-from mpmopt.app.summary import table
+from mpmopt.app.ending import ending
 from mpmopt.io.console import how_to_go_on, reported
 
 
@@ -62,10 +62,12 @@ def main(description: str, cases: Mapping[str, Case], argv: list[str] | None = N
     if arguments.starts is None:
         if arguments.scheduler:
             parser.error("--scheduler is for --starts: one run is one process")
-        return reported(
-            lambda: print(table(run(case, out, force=force, full_study=setting == "default"))),
-            lambda: how_to_go_on(out / "run.h5"),
-        )
+
+        def whole() -> None:
+            run(case, out, force=force, full_study=setting == "default")
+            print(ending(out / "run.h5"))
+
+        return reported(whole, lambda: how_to_go_on(out / "run.h5"))
     if arguments.starts < 1:
         parser.error(f"--starts {arguments.starts}: at least 1")
     from mpmopt.app.multistart import multistart

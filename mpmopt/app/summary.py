@@ -105,7 +105,7 @@ def _value_or_none(function: Callable[[], float]) -> float | None:
     try:
         return _number_or_none(function())
     except SimulationError as error:
-        logger.warning("no value: %s", error)
+        logger.info("no value: %s", error)
         return None
 
 

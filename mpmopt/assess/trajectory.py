@@ -176,6 +176,20 @@ class Motion:
         return self.scene.grid.dx / self.scene.particles_per_cell
 
     @property
+    def centroid(self) -> NDArray[np.float64]:
+        """Mean place (F, 2) of all material."""
+        return self._mean(self.position)
+
+    @property
+    def mean_velocity(self) -> NDArray[np.float64]:
+        """That of all material (F, 2)."""
+        return self._mean(self.velocity)
+
+    def _mean(self, values: NDArray[np.float32]) -> NDArray[np.float64]:
+        found: NDArray[np.float64] = values.astype(float) @ self.gamma / self.gamma.sum()
+        return found
+
+    @property
     def box(self) -> NDArray[np.float64]:
         """Lower and upper corner (2, 2) of where particles with material are at all instants."""
         seen = self.position[:, :, self.gamma >= SEEN]

@@ -136,5 +136,10 @@ def how_to_go_on(path: Path) -> str:
     """Advice to someone whose run was interrupted."""
     if not os.access(path, os.F_OK):
         return "Nothing was computed yet; the same command begins anew."
-    command = shlex.join(["python", "-m", "mpmopt", "resume", str(path)])
-    return f"Every evaluation is saved; go on with: {command}"
+    again = command("-m", "mpmopt", "resume", str(path))
+    return f"Every evaluation is saved; go on with: {again}"
+
+
+def command(*words: str) -> str:
+    """A line to paste into a shell, with the interpreter that runs now."""
+    return shlex.join([sys.executable or "python", *words])

@@ -33,10 +33,12 @@ class Progress:
     ----------
     count : int
         How many are done.
+    total : int or None
+        How many there will be, as far as it is known.
     """
 
     def __init__(self, unit: str, total: int | None = None) -> None:
-        self._unit, self._total, self.count = unit, total, 0
+        self._unit, self.total, self.count = unit, total, 0
         self._every = max(1, total // LINES) if total else LINES
         self._began = time.monotonic()
         self._stream = sys.stderr
@@ -58,12 +60,12 @@ class Progress:
 
     def step(self, text: str = "") -> None:
         """One step more is done; `text` says what it gave."""
-        self._bar.n = self.count
+        self._bar.n, self._bar.total = self.count, self.total
         self.count += 1
         self._bar.set_postfix_str(text, refresh=False)
         self._bar.update()
         if self._bar.disable and self.count % self._every == 0:
-            of = f" of {self._total}" if self._total else ""
+            of = f" of {self.total}" if self.total else ""
             seconds = time.monotonic() - self._began
             line = f"{self.count}{of} {self._unit}, {seconds:.0f} s"
             say(f"{line}: {text}" if text else line)

@@ -10,12 +10,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mpmopt.design.objective import Objective
 from mpmopt.design.problem import Problem
 from mpmopt.design.task import Task
+from mpmopt.design.terms import Displacement
 from mpmopt.errors import DesignError
 from mpmopt.optimisation.settings import Settings
 from mpmopt.scene import Scene
-from mpmopt.scene.particles import own
+from mpmopt.scene.particles import discretise, own
 from mpmopt.validation import digits
 
 
@@ -224,6 +226,28 @@ class Optimisation:
         """The problem that `result` solves, in the time step that it was evaluated with."""
         best = self.result
         return self.settings.stages[best.stage].problem(self.scene, best.time_step, task=self.task)
+
+    @property
+    def chosen(self) -> int:
+        """Number, from 1, of the evaluation that `result` is of."""
+        return self.number_of(self.result)
+
+    def number_of(self, item: Candidate) -> int:
+        """Number, from 1, of the evaluation that a design is of: no two are of the same time."""
+        return 1 + next(k for k, each in enumerate(self.history) if each.seconds == item.seconds)
+
+    @property
+    def measure(self) -> str:
+        """What the objective is called: that of the paper is a displacement, from `origin` on."""
+        return "displacement" if isinstance(self.task.maximise, Displacement) else "objective"
+
+    @property
+    def origin(self) -> float:
+        """The objective of a body that stays put, if it is a displacement; else 0."""
+        if not isinstance(self.task.maximise, Displacement):
+            return 0.0
+        particles = discretise(self.scene)
+        return Objective.of(self.scene, particles, self.task.maximise.direction).start
 
     def __repr__(self) -> str:
         found, stages = "no design yet", self.settings.stages

@@ -293,7 +293,7 @@ class _Ascent:
             if spare is not None and not np.array_equal(spare, x):
                 return spare
             scene = self.problem.scene
-            logger.warning("no design of this stage ran yet: time step %g halved", scene.time_step)
+            logger.info("no design of this stage ran yet: time step %g halved", scene.time_step)
             self._pose(scene.time_step / 2.0)
             return x
         if self.failures and self.incumbent is not None:
@@ -351,7 +351,7 @@ class _Ascent:
             time_step = evaluation.time_step
         except SimulationError as error:
             failure = str(error)
-            logger.warning("evaluation %d failed: %s", len(run.history), error)
+            logger.info("evaluation %d failed: %s", len(run.history), error)
         solid = refined = np.nan
         if self.stage.solid and not failure:
             solid = self._without_void(post_processed, problem.at(time_step), x)
@@ -434,7 +434,7 @@ class _Ascent:
         try:
             return distance(problem, x)
         except (SceneError, SimulationError) as error:
-            logger.warning("the design fails without void: %s", error)
+            logger.info("the design fails without void: %s", error)
             return np.nan
 
     def _stop_reason(self) -> str:

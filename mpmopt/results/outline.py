@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 import contourpy
 import numpy as np
@@ -24,6 +25,9 @@ GRAIN = 1024
 CUT = 8
 # In units of the filtered design, which is within [-1, 1].
 SOLID, OUTSIDE = 2.0, -4.0
+
+
+Part = Literal["body", "passive", "actuator"]
 
 
 @dataclass(frozen=True)
@@ -60,6 +64,7 @@ def outline(
     x: NDArray[np.float64],
     threshold: float = THRESHOLD,
     keep: NDArray[np.bool_] | None = None,
+    part: Part = "body",
 ) -> list[Polygon]:
     """Where a design is solid: gamma >= threshold, and all regions that are not designed.
 
@@ -77,6 +82,9 @@ def outline(
         Of gamma, between 0 and 1.
     keep : (D,) array of bool, optional
         Design particles that may be drawn; the others are cut out, each with its square.
+    part : {"body", "passive", "actuator"}, optional
+        What is drawn: the whole body, all of it but its actuators, or its actuators. The last two
+        meet along the edges of the actuators' regions.
 
     Returns
     -------
@@ -113,6 +121,9 @@ def outline(
     i, j = (cell - low).T
     empty[i, j] = np.where(body.designed, np.nan, SOLID)
     cut = of_all(solid & ~drawn, False)
+    drives = body.actuator >= 0
+    shown = {"body": drives | ~drives, "passive": ~drives, "actuator": drives}[part]
+    cut |= ~shown
     empty[i[cut], j[cut]] = OUTSIDE
     field = samples(empty)
     lines = [
@@ -131,7 +142,7 @@ def outline(
         for coordinates, offsets in zip(*contours.filled(level, 2.0 * SOLID), strict=True)
         for loop in np.split(coordinates, offsets[1:-1])
     ]
-    centres = body.position[of_all(drawn, True)]
+    centres = body.position[of_all(drawn, True) & shown]
     polygons = _polygons([ring * (spacing / GRAIN) for ring in _parted(loops)])
     held = [polygon for polygon in polygons if polygon.contains(centres).any()]
     return sorted(held, key=lambda polygon: -polygon.area)

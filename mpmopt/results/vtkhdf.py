@@ -38,6 +38,7 @@ def content(motion: Motion) -> bytes:
         "stretch": np.linalg.norm(F, ord=2, axis=(2, 3)),
     }
     with file_in_memory() as file:
+        file.attrs["made_by"] = "mpmopt"
         root = file.create_group("VTKHDF")
         root.attrs["Version"] = (2, 0)
         root.attrs["Type"] = np.bytes_("UnstructuredGrid")

@@ -48,10 +48,10 @@ BESIDE, ABOVE = 290, 560  # width in pixels of a panel beside others, and above 
 
 def playing_time(scene: Scene) -> float:
     """Seconds that a film of a scene takes, so that its gait is seen."""
-    return min(max(PERIOD * _periods(scene), SHORTEST), LONGEST)
+    return min(max(PERIOD * periods(scene), SHORTEST), LONGEST)
 
 
-def _periods(scene: Scene) -> float:
+def periods(scene: Scene) -> float:
     """Periods of the fastest actuator within a scene's duration."""
     fastest = max((actuator.angular_frequency for actuator in scene.actuators), default=0.0)
     return scene.duration * fastest / (2.0 * math.pi)
@@ -231,12 +231,12 @@ def film(path: Path, run: Optimisation, seconds: float | None = None) -> Filmed:
 
         content = writers[path.suffix.lower()](frames())
     replace_file(path, content)
-    periods = _periods(scene)
-    per_period = count / periods if periods else 0.0
+    shown = periods(scene)
+    per_period = count / shown if shown else 0.0
     if 0.0 < per_period < LEAST:
         logger.warning(
             "the film has %.1f frames per period of the actuation; with %.2g seconds it has %d",
-            per_period, LEAST * periods / RATE, LEAST,
+            per_period, LEAST * shown / RATE, LEAST,
         )  # fmt: skip
     return Filmed(count, seconds + LAST, slow, per_period, len(content))
 

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from numpy.typing import NDArray
-from scipy.ndimage import binary_dilation, label
 
+from mpmopt.assess.feet import BEARS, FEET, feet
 from mpmopt.assess.robustness import SEEN, SETTLED, Robot, lasting
 from mpmopt.assess.trajectory import Body, Motion
 from mpmopt.design.terms import Displacement
@@ -28,8 +27,6 @@ from mpmopt.view.draw import (
 
 INSTANTS = 8  # of a stride
 PERIODS, PER_PERIOD = 6, 32  # of a gait diagram: periods whose feet are seen, and frames in each
-FEET = 6  # that a gait diagram has room for: those that bear for longest
-BEARS = 0.1  # of the largest load on any foot: one with more is on the ground
 KEPT = {
     "half_step": "half the step",
     "finer_cells": "cells 1/2",
@@ -92,60 +89,6 @@ def plot_stride(path: str | os.PathLike[str], robot: Robot) -> None:
         axes.set_xticks([])
         axes.set_yticks([])
     replace_file(path, png(figure))
-
-
-class Foot(NamedTuple):
-    """A patch of particles that touches ground.
-
-    Attributes
-    ----------
-    place, height : (F,) arrays
-        Its mean coordinate along the direction, and its least distance from the ground.
-    load : (F,) array
-        Sum over its particles of how deep they are in the layer, over its thickness: times what a
-        particle bears, the normal force.
-    """
-
-    place: NDArray[np.float64]
-    height: NDArray[np.float64]
-    load: NDArray[np.float64]
-
-
-def feet(motion: Motion) -> list[Foot]:
-    """The parts of a body that come into the layers of a scene's ground, the hindmost first.
-
-    Parameters
-    ----------
-    motion : Motion
-        At F instants, the first of them the start. Particles that touch, and were within two
-        spacings of each other there, are one foot; of a scene with a mirror those of one half.
-    """
-    scene = motion.scene
-    position = motion.position.astype(float)
-    if scene.mirror is not None:
-        position = position[:, :, : position.shape[2] // 2]
-    distance = np.full(position[:, 0].shape, np.inf)
-    depth = np.zeros(distance.shape)
-    for layer in scene.layers:
-        d, _ = layer.line.distance(np.moveaxis(position, 1, 0))
-        distance = np.minimum(distance, d)
-        depth += np.maximum(1.0 - d / layer.thickness, 0.0)
-    often = depth.any(axis=0)
-    if not often.any():
-        return []
-    index = np.floor(position[0] / motion.spacing).astype(int)
-    i, j = index - index.min(axis=1, keepdims=True)
-    lattice = np.zeros((i.max() + 1, j.max() + 1), dtype=bool)
-    lattice[i[often], j[often]] = True
-    near = np.ones((3, 3))
-    names = np.where(often, label(binary_dilation(lattice, near), near)[0][i, j], 0)
-    along = np.einsum("k,fkp->fp", scene.direction, position)
-    found = [
-        Foot(along[:, its].mean(axis=1), distance[:, its].min(axis=1), depth[:, its].sum(axis=1))
-        for its in (names == number for number in range(1, names.max() + 1))
-    ]
-    largest = sorted(found, key=lambda foot: -foot.load.sum())[:FEET]
-    return sorted(largest, key=lambda foot: float(foot.place[0]))
 
 
 @own_style()
