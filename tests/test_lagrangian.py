@@ -140,6 +140,18 @@ def test_the_gradient_is_the_same_for_all_checkpoints(rng):
             assert np.array_equal(gradient, whole[1])
 
 
+@pytest.mark.slow
+def test_single_precision_loses_digits_but_few(rng):
+    double, single = (
+        Problem(lattice_scene(), precision=precision) for precision in ("double", "single")
+    )
+    x = rng.uniform(-0.8, 0.8, double.size)
+    value, gradient = double.value_and_gradient(x)
+    coarse, also = single.value_and_gradient(x)
+    assert 0.0 < abs(coarse - value) <= 1e-5
+    assert np.linalg.norm(also - gradient) <= 1e-3 * np.linalg.norm(gradient)
+
+
 def channel(mirror):
     """A block between two grounds, whole or half of it."""
     body = (
