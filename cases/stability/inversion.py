@@ -1,6 +1,6 @@
 """Inversion: the generalized vortex, a ring whose inside is turned by a body force."""
 
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -61,7 +61,9 @@ class Vortex:
         return float(np.sqrt((miss**2).sum(axis=0).mean())) / self.amplitude
 
 
-def square(cells: int, courant: float, formulation: str = "updated") -> Scene:
+def square(
+    cells: int, courant: float, formulation: Literal["updated", "total"] = "updated"
+) -> Scene:
     """The solution has no displacement outside the ring: any body that holds it will do."""
     dx = 2.0 * CENTRE / cells
     return Scene(
