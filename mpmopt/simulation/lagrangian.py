@@ -17,7 +17,7 @@ from mpmopt.scene.parts import Vector
 from mpmopt.simulation.buffers import Memory
 from mpmopt.simulation.checkpoints import Checkpointing, Checkpoints, Schedule
 from mpmopt.simulation.energy import LOOK
-from mpmopt.simulation.indicators import WATCH, Indicators, Watched, wanted_steps
+from mpmopt.simulation.indicators import Indicators, Watched, wanted_steps
 from mpmopt.simulation.simulation import Forward, Gradient, Simulation, check_terminal_adjoints
 
 
@@ -68,7 +68,7 @@ class LagrangianSimulation(Simulation):
         actuated = actuated.reshape(-1, records, 4)
         constants = np.array([of_particles(each) for each in self.data.constants])
         alike = bool(np.all(constants == constants[:, :1]))
-        mass = self._weights[0].T @ of_particles(self.data.mass)
+        mass = (self._weights[0].T @ of_particles(self.data.mass)).astype(dtype)
         axis = self._mirror_axis(high)
         grip, self._grip_slope = pairs.grips(
             of_particles(self.data.stiffness), constants[0] + 2.0 * constants[1], dx / per_cell, dx
@@ -271,11 +271,11 @@ class LagrangianSimulation(Simulation):
     def watch(self, instants: Collection[int] = ()) -> Watched:
         """As `Simulation.watch`."""
         watcher = _Watcher(self, instants)
-        length = min(WATCH, self.steps)
+        length = min(LOOK, self.steps)
         states = np.zeros((length + 1, *self.start.shape), self.start.dtype)
         states[0] = self.start
-        for first in range(0, self.steps, WATCH):
-            last = min(first + WATCH, self.steps)
+        for first in range(0, self.steps, LOOK):
+            last = min(first + LOOK, self.steps)
             self._advance(states, first, last, first)
             watcher.follow(states, first, last)
             states[0] = states[last - first]
