@@ -45,8 +45,6 @@ class Bar:
     per_cell : int
         Particles per cell and direction.
     checkpointing : Checkpointing, optional
-    blend_time : float, optional
-        As in `Scene`.
     precision : {"double", "single"}, optional
     viscosity : float, optional
         eta, which makes the middle move by `damped` times as much.
@@ -58,7 +56,7 @@ class Bar:
     duration = 11.25  # periods: one and an eighth
 
     def __init__(
-        self, n, courant, per_cell=2, checkpointing=None, blend_time=0.0, precision="double",
+        self, n, courant, per_cell=2, checkpointing=None, precision="double",
         viscosity=0.0,
     ):  # fmt: skip
         dx = self.length / n
@@ -69,7 +67,6 @@ class Bar:
             material=Material(0.0, self.speed**2 / 2.0, viscosity=viscosity),
             body=(Solid((free, 4 * dx), (held + self.length, 6 * dx)),),
             particles_per_cell=per_cell, mirror=Mirror("x", held), direction=(0.0, 1.0),
-            blend_time=blend_time,
         )  # fmt: skip
         particles = discretise(scene)
         beta = math.pi / (2.0 * self.length)
@@ -155,10 +152,9 @@ def manufactured_error(n, amplitude, courant=0.2, per_cell=2):
     every, window = (0, groups), (0, 0, side, side)
     old = kernels.grouped(old)
     new = old.copy()
-    nodes, velocity = np.zeros((1, side * side, kernels.NODE_SIZE)), np.zeros((1, 2 * side * side))
+    grid, velocity = np.zeros((side * side, kernels.NODE_SIZE)), np.zeros(2 * side * side)
     cells, velocity_cells = np.zeros((9 * side * side, 4)), np.zeros(18 * side * side)
-    tile, grid = kernels.make_tile(groups, old), nodes[0]
-    log_J = np.zeros((groups, 4))
+    tile, log_J = kernels.make_tile(groups, old), np.zeros((groups, 4))
     worst = 0.0
     for step in range(steps):
         push = dt * force(step * dt)
@@ -173,8 +169,8 @@ def manufactured_error(n, amplitude, courant=0.2, per_cell=2):
         mirror(grid.reshape(side, side, 4), 0, n)
         mirror(grid.reshape(side, side, 4).transpose(1, 0, 2), 1, n)
         for column in range(side):
-            kernels.grid_update(nodes, window, parameters, parameters.clamps[0], velocity, column)
-        kernels.taylor(velocity[0], window, window, velocity_cells)
+            kernels.grid_update(grid, window, parameters, parameters.clamps[0], velocity, column)
+        kernels.taylor(velocity, window, window, velocity_cells)
         kernels.g2p(old, new, parameters, tile, velocity_cells, *every)
         old, new = new, old
         u, _ = exact((step + 1) * dt)

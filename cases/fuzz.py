@@ -155,8 +155,7 @@ def plausible(draw: Any) -> dict[str, Any]:
     clamps = []
     if draw(st.integers(0, 3)) == 0:
         clamps = [draw(clamp(dx, time_step, mirrored))]
-    blend_time = draw(st.sampled_from([0.0, 0.0, 2.0, 1e9])) * time_step
-    total = not (walls or clamps or blend_time) and draw(st.booleans())
+    total = not (walls or clamps) and draw(st.booleans())
     time_step *= 0.7 if total else 1.0
     return {
         "grid": {"cells": list(cells), "dx": dx},
@@ -173,7 +172,6 @@ def plausible(draw: Any) -> dict[str, Any]:
         "direction": [1.0, 0.0] if mirrored or draw(st.booleans()) else [0.6, -0.8],
         "particles_per_cell": per_cell,
         "filter_length": draw(st.sampled_from([0.0, dx])),
-        "blend_time": blend_time,
         "mirror": {"axis": "y", "position": 3 * dx} if mirrored else None,
     }
 

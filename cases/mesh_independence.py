@@ -50,7 +50,6 @@ class Choice:
     damping: float | None = None
     friction: float = 0.5
     viscosity: float = 0.02
-    blend_time: float = 0.0
     per_cell: int = 2
     steps: int = 1  # as many as usual, times this
     actuated: bool = True
@@ -70,7 +69,6 @@ class Choice:
         return replace(
             scene,
             steps=round(seconds / dt),
-            blend_time=self.blend_time,
             material=replace(scene.material, viscosity=self.viscosity),
             walls=() if self.layer else (Wall("y", 4 * C, friction=0.5),),
             ground=(floor,) if self.layer else (),
@@ -89,7 +87,6 @@ CHOICES = (
     Choice("layer, twice as thick", thickness=2 * C),
     Choice("layer, friction 0.3", friction=0.3),
     Choice("layer, viscosity 0.05", viscosity=0.05, steps=2),
-    Choice("layer, blend time 2e-3", blend_time=2e-3),
     Choice("layer, 3 x 3 a cell", per_cell=3),
     Choice("layer, total Lagrangian", formulation="total"),
     Choice("layer, no actuation", actuated=False),

@@ -119,7 +119,6 @@ class Choice:
     per_cell: int = 2
     precision: Literal["double", "single"] = "double"
     memory: int = 256_000_000
-    blend_time: float = 0.0
 
 
 PLAIN = Choice("2 x 2 a cell, double", "o")
@@ -127,10 +126,6 @@ MORE_PARTICLES = Choice("3 x 3 a cell", "s", per_cell=3)
 SINGLE = Choice("single precision", "^", precision="single")
 LITTLE_MEMORY = Choice("64 MB of states", "v", memory=64_000_000)
 ALL_KEPT = Choice("all states kept", "P", memory=2**33)
-BLENDS = tuple(
-    Choice(f"blend time {1e3 * tau:g} ms", marker, blend_time=tau)
-    for tau, marker in ((2e-3, "D"), (1e-2, "X"))
-)
 PEERS = {
     "Taichi, double": ("taichi_mpm", "taichi", "*"),
     "Taichi, single": ("taichi_mpm", "taichi", "h"),
@@ -209,9 +204,7 @@ def settings(quick: bool) -> list[tuple[int, float, Choice]]:
     if not quick:
         points += [PAPER, (256, 0.4, MORE_PARTICLES)]
         points += [(n, 0.8, SINGLE) for n in (64, 128, 256)]
-    cells = (64,) if quick else (64, 128)
-    blends = [(n, courant) for n in cells for courant in (0.1, 0.2, 0.4, 0.8)]
-    return points + [(*where, blend) for where in blends for blend in BLENDS]
+    return points
 
 
 COURANTS = (0.05, 0.1, 0.2, 0.4, 0.6, 0.8)
@@ -239,8 +232,7 @@ def nearest_possible(name: str, point: tuple[int, float, Choice]) -> tuple[int, 
 def measure_bar(n: int, courant: float, choice: Choice) -> Measured:
     """The bar in one discretisation."""
     bar = Bar(
-        n, courant, choice.per_cell, Checkpointing(memory=choice.memory), choice.blend_time,
-        choice.precision,
+        n, courant, choice.per_cell, Checkpointing(memory=choice.memory), choice.precision
     )  # fmt: skip
     scene = bar.simulation.scene
     here = replace(Discretisation.of(scene), precision=choice.precision)
@@ -255,7 +247,6 @@ def measure_bar(n: int, courant: float, choice: Choice) -> Measured:
 def measure_robot(name: str, scene: Scene, n: int, courant: float, choice: Choice) -> Measured:
     """A robot in one discretisation."""
     _, phi = ROBOTS[name]
-    scene = replace(scene, blend_time=choice.blend_time)
     here = Discretisation.of(
         scene, n / scene.grid.cells[0], courant,
         particles_per_cell=choice.per_cell, precision=choice.precision,
@@ -433,23 +424,21 @@ def manufactured() -> list[dict[str, str]]:
 
 
 def travels(points: Sequence[Point]) -> list[dict[str, str]]:
-    """Distance by step, over the reference's: one line for each robot, n and transfer."""
+    """Distance by step, over the reference's: one line for each robot and n."""
     rows = []
     for name in ROBOTS:
-        for choice in (PLAIN, *BLENDS):
-            for n in sorted({p.n for p in points}):
-                line = {
-                    p.courant: p.travel_ratio
-                    for p in points
-                    if (p.scene, p.choice, p.n) == (name, choice.name, n)
-                }
-                if not line:
-                    continue
-                row = {"robot": name, "transfer": "APIC" if choice is PLAIN else choice.name}
-                row["n"] = str(n)
-                for courant in COURANTS:
-                    row[f"{courant:g}"] = f"{line[courant]:.3f}" if courant in line else ""
-                rows.append(row)
+        for n in sorted({p.n for p in points}):
+            line = {
+                p.courant: p.travel_ratio
+                for p in points
+                if (p.scene, p.choice, p.n) == (name, PLAIN.name, n)
+            }
+            if not line:
+                continue
+            row = {"robot": name, "n": str(n)}
+            for courant in COURANTS:
+                row[f"{courant:g}"] = f"{line[courant]:.3f}" if courant in line else ""
+            rows.append(row)
     return rows
 
 
@@ -522,7 +511,6 @@ def draw(path: Path, points: Sequence[Point], known: dict[str, tuple[float, floa
     from matplotlib.lines import Line2D
 
     markers = {c.name: c.marker for c in (PLAIN, MORE_PARTICLES, SINGLE, LITTLE_MEMORY, ALL_KEPT)}
-    markers.update({blend.name: blend.marker for blend in BLENDS})
     markers.update({name: marker for name, (_, _, marker) in PEERS.items()})
     figure, axes = plt.subplots(3, len(TITLES), figsize=(5.3 * len(TITLES), 14.5))
     for column, (name, title) in enumerate(TITLES.items()):
@@ -613,20 +601,16 @@ def _scatter(
 def _steps(ax, points: Sequence[Point]) -> None:
     """Distance by Courant number, the reference's being one."""
     for n, colour in COLOURS.items():
-        for choice, style in zip((PLAIN, *BLENDS[:1]), ("-o", "--D")):
-            line = sorted(
-                (p.courant, p.travel_ratio) for p in points if p.n == n and p.choice == choice.name
-            )
-            if line:
-                ax.plot(
-                    *zip(*line), style, color=colour, ms=5, lw=1.2,
-                    mfc=colour if choice is PLAIN else "white",
-                )  # fmt: skip
+        line = sorted(
+            (p.courant, p.travel_ratio) for p in points if p.n == n and p.choice == PLAIN.name
+        )
+        if line:
+            ax.plot(*zip(*line), "-o", color=colour, ms=5, lw=1.2)
     ax.axhline(1.0, color="black", lw=0.8)
     ax.set_xscale("log")
     ax.set_xticks(COURANTS, [f"{c:g}" for c in COURANTS])
     ax.minorticks_off()
-    ax.set_xlabel("Courant number (solid: APIC; dashed: blended)")
+    ax.set_xlabel("Courant number")
     ax.set_ylabel("distance, relative to the reference")
     ax.grid(True, alpha=0.3)
 

@@ -22,12 +22,13 @@ import walker
 from numpy.typing import NDArray
 
 from mpmopt.app.case import START
-from mpmopt.assess.refinement import finer, mapped
+from mpmopt.assess.refinement import mapped
 from mpmopt.assess.threshold import Baseline, distance, post_processed
 from mpmopt.design.actuation import signal
 from mpmopt.design.chain import interpolate
 from mpmopt.design.objective import Objective
 from mpmopt.design.problem import Problem, Variables
+from mpmopt.design.variation import refined
 from mpmopt.errors import MpmoptError, SimulationError
 from mpmopt.optimisation.loop import Optimisation, optimise
 from mpmopt.optimisation.settings import Settings, Stage
@@ -163,7 +164,7 @@ def rows_of(name: str, cells: int, iterations: int) -> Iterator[Row]:
         print(f"{name}, {label}: {runs[label].failed_evaluations} failed", file=sys.stderr)
     changes = [
         moved(there, keep, variables)
-        for there in (scene, finer(scene))
+        for there in (scene, refined(scene, 2))
         # The last one's void is left out: it is as binary as they come.
         for keep, variables in designs(there, baseline, runs[label])
     ]

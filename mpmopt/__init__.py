@@ -27,6 +27,7 @@ _HOMES = {
     "Effort": "mpmopt.design.terms",
     "Volume": "mpmopt.design.terms",
     "OnePiece": "mpmopt.design.one_piece",
+    "Variation": "mpmopt.design.variation",
     "Settings": "mpmopt.optimisation.settings",
     "Stage": "mpmopt.optimisation.settings",
     "optimise": "mpmopt.optimisation.loop",
@@ -47,6 +48,7 @@ if TYPE_CHECKING:
     from mpmopt.design.terms import Effort as Effort
     from mpmopt.design.terms import Speed as Speed
     from mpmopt.design.terms import Volume as Volume
+    from mpmopt.design.variation import Variation as Variation
     from mpmopt.optimisation.loop import optimise as optimise
     from mpmopt.optimisation.minimize import minimize as minimize
     from mpmopt.optimisation.settings import Settings as Settings

@@ -5,7 +5,7 @@ examples:
   mpmopt plot out/walker/run.h5                        pictures of it
   mpmopt film out/walker/run.h5                        and a film
   mpmopt verify out/walker/run.h5                      are its gradients right?
-  mpmopt refine out/walker/run.h5                      does its design keep its gain?
+  mpmopt study out/walker/run.h5                       does it go elsewhere, and for long?
 
 mpmopt COMMAND --help tells more. "python -m mpmopt" is the same as "mpmopt".
 
@@ -44,7 +44,7 @@ def plot(path: Path, out: Path | None, force: bool) -> int:
 
     run = _read(path).run
     folder = out or path.parent
-    files = picture_files(folder).values()
+    files = picture_files(folder, run.scene).values()
     refuse_existing(files if out else (), force)
     make_folder(folder)
     with Progress("pictures", len(files)) as progress:
@@ -136,11 +136,14 @@ def postprocess(path: Path, threshold: float) -> int:
     return 0
 
 
-def refine(path: Path) -> int:
-    """Print whether a run's best design, without void, keeps its gain in other discretisations."""
+def study(path: Path) -> int:
+    """Print whether a run's best design keeps its gain and goes elsewhere; keep it in the run."""
     import numpy as np
 
-    from mpmopt.assess.refinement import VARIANTS, Variant, study
+    from mpmopt.app.study import full_study
+    from mpmopt.assess.refinement import VARIANTS, Variant
+    from mpmopt.assess.refinement import study as refined
+    from mpmopt.assess.robustness import can_be_studied
     from mpmopt.io.progress import Progress
     from mpmopt.validation import digits
 
@@ -163,7 +166,9 @@ def refine(path: Path) -> int:
             f"{'post-processed design':<21}  {'cells':>9}  {'step':>8}   reference     design  "
             "gain retained"
         )
-        study(run.problem(), run.result.x, progress=show)
+        refined(run.problem(), run.result.x, progress=show)
+    if can_be_studied(run.scene):
+        print(full_study(path))
     return 0
 
 
@@ -325,7 +330,8 @@ def _parser() -> argparse.ArgumentParser:
         "plot",
         "draw its scene, its designs in motion and its history",
         "Write schematic.png, history.png and, in motion, design.png (as it was optimised),\n"
-        "post_processed.png (without grey) and reference.png (the solid reference design).",
+        "post_processed.png (without grey) and reference.png (the solid reference design); of a\n"
+        "robot on ground stride.png (a period of its gait) and gait.png (its feet over time).",
         "out/walker/run.h5",
         "out/walker/run.h5 --out pictures",
     )
@@ -375,13 +381,17 @@ def _parser() -> argparse.ArgumentParser:
     command.set_defaults(do=postprocess)
 
     command = add(
-        "refine",
-        "simulate its best design more finely",
+        "study",
+        "try its best design elsewhere",
         "Say how much of its gain the best design, without void, keeps with half the step, twice\n"
-        "the step, and cells half as wide. Numerical propulsion keeps little.",
+        "the step, and cells half as wide: numerical propulsion keeps little. Then, of a robot on\n"
+        "ground, how fast it goes on ground of other frictions, in both formulations on other\n"
+        "cells, with stronger and faster actuators, without actuation and after a push, and for\n"
+        "how long it goes on. The numbers go to the run file and summary.json, and robustness.png\n"
+        "shows them.",
         "out/walker/run.h5",
     )
-    command.set_defaults(do=refine)
+    command.set_defaults(do=study)
 
     command = add(
         "forces",

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from conftest import small_scene
 
+from mpmopt.design.evaluation import Evaluation
 from mpmopt.design.objective import Objective
-from mpmopt.design.problem import Evaluation, Problem
+from mpmopt.design.problem import Problem
 from mpmopt.errors import DesignError
 from mpmopt.optimisation.loop import optimise
 from mpmopt.optimisation.mma import MMAError, MovingAsymptotes

@@ -350,9 +350,9 @@ def test_a_step_filters_and_projects_its_design_once_however_it_is_judged(start,
     # As it is, without its void, and in other discretisations.
     projected, real = [], chain.project
 
-    def project(phi, beta):
+    def project(phi, beta, threshold):
         projected.append(phi)
-        return real(phi, beta)
+        return real(phi, beta, threshold)
 
     monkeypatch.setattr(chain, "project", project)
     stage = Stage(4.0, 1e-2, 1e-3, 4e-3, solid=True, refined=True, void_cutoff=0.05)

@@ -1,12 +1,11 @@
 """The smallest version of the command that asks whether the grid matters."""
 
 import csv
-from dataclasses import replace
 
 import mesh_independence
 import numpy as np
 import pytest
-from mesh_independence import CHOICES, displacement, stepped_legs
+from mesh_independence import CHOICES, Choice, displacement, stepped_legs
 from walker import slanted_legs
 
 from mpmopt.scene.particles import discretise
@@ -32,20 +31,14 @@ def test_the_choices_are_scenes_that_differ_in_what_they_say():
             assert bool(scene.ground) is choice.layer is not bool(scene.walls)
 
 
-def test_a_step_of_half_the_length_moves_the_walker_as_far_with_a_blend():
-    plain, blended = (
-        [displacement(replace(LAYER, blend_time=tau), 64, k)["displacement"] for k in (0, 1)]
-        for tau in (0.0, 2e-3)
-    )
-    assert blended[1] == pytest.approx(blended[0], rel=0.015)
-    assert abs(plain[1] - plain[0]) > abs(blended[1] - blended[0])
-    assert plain[0] == pytest.approx(0.0929, abs=0.002)
+def test_the_walker_moves_as_far_as_measured():
+    assert displacement(LAYER, 64)["displacement"] == pytest.approx(0.0929, abs=0.002)
 
 
 def test_from_64_to_128_cells_the_walker_goes_as_far_and_does_not_where_it_falls():
     found = {
         name: [displacement(choice, cells)["displacement"] for cells in (64, 128)]
-        for name, choice in (("stands", LAYER), ("falls", replace(LAYER, fall=1.0)))
+        for name, choice in (("stands", LAYER), ("falls", Choice("falls", fall=1.0)))
     }
     apart = {name: abs(b - a) / a for name, (a, b) in found.items()}
     assert apart["stands"] <= 0.01

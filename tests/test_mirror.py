@@ -69,6 +69,19 @@ def test_half_the_body_is_the_same_solution(scene, steps):
 
 
 @pytest.mark.parametrize("axis", ["x", "y"])
+def test_four_steps_of_a_half_are_those_of_the_whole_and_their_gradient_is_exact(axis):
+    scene = channel(axis)
+    (half, whole), (x_half, x_whole), image = both(scene, 4)
+    value, gradient = half.value_and_gradient(x_half)
+    other, full = whole.value_and_gradient(x_whole)
+    assert value == pytest.approx(other, rel=1e-12)
+    folded = np.concatenate([np.bincount(image, whole.split(full).phi), full[-3:]])
+    assert np.abs(gradient - folded).max() <= 1e-11 * np.abs(folded).max()
+    assert worst(complex_step_test(half, x_half)) <= COMPLEX_TOLERANCE
+    assert max(kernel_mismatches(scene).values()) <= 1e-13
+
+
+@pytest.mark.parametrize("axis", ["x", "y"])
 def test_gradient_and_kernels_of_a_half(axis):
     scene = channel(axis)
     (half, _), (x, _), _ = both(scene, 40)

@@ -1,7 +1,6 @@
 """Signals, objectives, walls and schedules against numbers worked out by hand."""
 
 import contextlib
-import dataclasses
 import math
 
 import numpy as np
@@ -80,15 +79,12 @@ def test_the_kernels_know_the_walls_of_the_scene():
             Wall("x", 3 * c),
             Wall("x", 12 * c, "above", friction=0.0),
         ),
-        blend_time=8e-3,
     )
     parameters = parameters_of(scene)
     assert parameters.walls[:, contact.AXIS].tolist() == [1, 0, 0]
     assert parameters.walls[:, contact.SIDE].tolist() == [1, 1, -1]
     assert parameters.walls[:, contact.NODE].tolist() == [4, 3, 12]
     assert parameters.walls[:, contact.FRICTION].tolist() == [0.25, math.inf, 0.0]
-    assert parameters.keep == pytest.approx(math.exp(-0.5))
-    assert parameters_of(dataclasses.replace(scene, blend_time=0.0)).keep == 0.0
 
 
 def test_margins_of_two_runs_are_the_worse_of_each():

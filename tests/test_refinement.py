@@ -10,9 +10,10 @@ from crawler import crawler
 from walker import slanted_legs, walker
 
 from mpmopt.__main__ import main
-from mpmopt.assess.refinement import finer, study
+from mpmopt.assess.refinement import study
 from mpmopt.assess.threshold import distance, retained_share
 from mpmopt.design.problem import Problem
+from mpmopt.design.variation import refined
 from mpmopt.errors import SceneError
 from mpmopt.optimisation.loop import optimise
 from mpmopt.results import runfile
@@ -46,7 +47,7 @@ def test_a_refinement_study_simulates_the_same_robot_with_other_steps_and_cells(
 
 def test_the_finer_robot_has_the_same_shape():
     for scene in (walker(64, 8e-4), crawler(64, 8e-4), small_scene()):
-        fine = finer(scene)
+        fine = refined(scene, 2)
         assert fine.courant == pytest.approx(scene.courant)
         assert fine.duration == pytest.approx(scene.duration)
         areas = [discretise(each).volume.sum() for each in (scene, fine)]
@@ -77,8 +78,8 @@ def test_a_wide_filter_is_no_obstacle_to_finer_cells():
     """Refined once more it would be too large for a scene, but solid bodies need none."""
     scene = climber(128, 5e-4, 10)
     with pytest.raises(SceneError, match="shorter filter_length"):
-        dataclasses.replace(finer(scene), filter_length=scene.filter_length)
-    assert finer(scene).grid.cells == (256, 256)
+        dataclasses.replace(refined(scene, 2), filter_length=scene.filter_length)
+    assert refined(scene, 2).grid.cells == (256, 256)
 
 
 def test_no_share_of_a_gain_that_is_rounding(tmp_path, capsys):
@@ -91,7 +92,7 @@ def test_no_share_of_a_gain_that_is_rounding(tmp_path, capsys):
     x = Problem(scene).join(np.empty(0), 0.2, 0.1, 0.1)
     path = tmp_path / "run.h5"
     runfile.write(path, optimise(scene, SHORT, x))
-    for name in ("postprocess", "refine"):
+    for name in ("postprocess", "study"):
         assert main([name, str(path)]) == 0
         said = capsys.readouterr()
         assert "nan" not in said.out + said.err

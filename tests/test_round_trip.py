@@ -11,12 +11,13 @@ from conftest import small_scene
 from mpmopt.design.problem import Problem
 from mpmopt.design.task import AtMost, Task
 from mpmopt.design.terms import Effort, OnePiece, Speed, Volume
+from mpmopt.design.variation import Variation
 from mpmopt.optimisation.history import Candidate, Iteration, Optimisation, StageState
 from mpmopt.optimisation.loop import begin
 from mpmopt.optimisation.mma import MovingAsymptotes
 from mpmopt.optimisation.settings import Settings, Stage
 from mpmopt.results import runfile
-from mpmopt.scene import Material, Mirror, Scene, Wall
+from mpmopt.scene import Ground, Material, Mirror, Scene, Wall
 
 numbers = itertools.count(2)
 
@@ -80,7 +81,11 @@ def run():
         Optimisation,
         scene=small_scene(),
         settings=settings,
-        task=Task(Speed(0.01) - 0.5 * Effort(), (AtMost(Volume(), 0.5), AtMost(OnePiece(), 1.0))),
+        task=Task(
+            Speed(0.01) - 0.5 * Effort(),
+            (AtMost(Volume(), 0.5), AtMost(OnePiece(), 1.0)),
+            2 * (Variation(friction=0.2, ground=(Ground.floor(0.1),)),),
+        ),
         x=np.array([0.5, -0.25]),
         stage=1,
         gave_up=True,
@@ -141,7 +146,7 @@ def test_every_field_of_a_scene_comes_back_from_its_text():
         time_step=5e-4, gravity=(0.0, -3.0),
         walls=(Wall("y", 4 * c, friction=0.25), Wall("x", 13 * c, "above")),
         direction=(0.6, 0.8), particles_per_cell=4, filter_weights=(0.5, 0.1, 0.025),
-        filter_length=0.125, transient=8e-3, blend_time=1e-3,
+        filter_length=0.125, transient=8e-3,
     )  # fmt: skip
     defaults = {
         field.name for field in dataclasses.fields(Scene)

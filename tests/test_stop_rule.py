@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from conftest import small_scene
 
-from mpmopt.design.problem import Evaluation, Problem
+from mpmopt.design.evaluation import Evaluation
+from mpmopt.design.problem import Problem
 from mpmopt.errors import SimulationError
 from mpmopt.optimisation.loop import Optimisation, begin, go_on, optimise
 from mpmopt.optimisation.mma import MovingAsymptotes

@@ -17,6 +17,7 @@ from mpmopt.assess.refinement import Variant
 from mpmopt.design.objective import Objective
 from mpmopt.design.problem import Problem
 from mpmopt.design.task import DEFAULT_TASK
+from mpmopt.design.variation import refined
 from mpmopt.errors import SimulationError
 from mpmopt.optimisation import presets
 from mpmopt.optimisation.history import Candidate, Optimisation
@@ -143,7 +144,7 @@ def test_loose_particles_are_those_that_hang_on_nothing(told):
 
 
 def test_a_case_starts_where_it_says(tmp_path, monkeypatch):
-    monkeypatch.setattr(case, "_go_on", lambda path, kept, checkpointing: kept.run.x)
+    monkeypatch.setattr(case, "_go_on", lambda path, kept, *_: kept.run.x)
     start = {"theta": (0.9, -0.75), "a": 0.5, "b": 0.25}
     study = Case(SCENE, SHORT, lambda position: position[:, 0] > 0.0, start)
     x: Any = case.run(study, tmp_path / "one")
@@ -153,7 +154,7 @@ def test_a_case_starts_where_it_says(tmp_path, monkeypatch):
 
 
 def test_a_baseline_is_kept_for_each_coarsening_of_the_stages(tmp_path, monkeypatch):
-    monkeypatch.setattr(case, "_go_on", lambda path, kept, checkpointing: kept.baseline)
+    monkeypatch.setattr(case, "_go_on", lambda path, kept, *_: kept.baseline)
     stages = (dataclasses.replace(STAGE, coarsening=2, time_step=4e-3, solid=False), STAGE)
     twice: list[dict[str, Any]] = [
         {name: tuple(2 * k for k in getattr(part, name)) for name in ("lower", "upper")}
@@ -197,7 +198,7 @@ def test_the_least_of_a_refinement_study_is_of_half_the_step_and_half_the_cells(
 def test_a_design_on_finer_cells_takes_each_particle_from_the_nearest():
     phi = np.where(PROBLEM.particles.position[PROBLEM.particles.designed][:, 0] < 5 / 16, 1.0, -1.0)
     x = PROBLEM.join(phi, 0.5, 0.0, 0.0)
-    fine = Problem(refinement.finer(SCENE))
+    fine = Problem(refined(SCENE, 2))
     there = refinement.mapped(fine.scene, PROBLEM, x)
     keep = threshold.kept(PROBLEM, x)
     assert 0 < keep.sum() < keep.size

@@ -10,7 +10,8 @@ import pytest
 from conftest import small_scene
 
 from mpmopt.app.summary import summarise, table
-from mpmopt.design.problem import Evaluation, Problem
+from mpmopt.design.evaluation import Evaluation
+from mpmopt.design.problem import Problem
 from mpmopt.design.task import FEASIBLE, AtMost, Task
 from mpmopt.design.terms import Displacement, Effort, OnePiece, Volume
 from mpmopt.errors import SimulationError

@@ -246,4 +246,6 @@ def test_json_holds_numbers_and_names_only():
         "kind": "Task",
         "maximise": {"kind": "Speed", "after": 0.5, "direction": None},
         "subject_to": [{"kind": "AtMost", "term": {"kind": "Volume"}, "bound": 0.4}],
+        "scenes": [],
+        "soft_minimum": 0.0,
     }

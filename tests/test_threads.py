@@ -120,12 +120,12 @@ def test_windows_that_outgrow_their_room_get_what_they_need_and_change_no_bit(mo
     ends = set()
     for nodes, part in (room, (10, room[1]), (room[0], 10), (10, 10)):
         memory = Segment(falling, 20, Memory())
-        memory.grids = memory.grids[:, :, :0]
+        memory.grids = memory.grids[:, :0]
         memory.resize(nodes, part)
         memory.states[0] = kernels.grouped(falling.initial)
         memory.advance(0, 20)
         ends.add(memory.states[20].tobytes())
-        assert memory.grids.shape[2] <= room[0]
+        assert memory.grids.shape[1] <= room[0]
         assert memory.scratch.parts.shape[2] <= room[1]
     assert len(ends) == 1
 

@@ -61,16 +61,13 @@ def scaled(scene, length, mass, time):
         material=solid(scene.material),
         gravity=tuple(length / time**2 * g for g in scene.gravity),
         filter_length=length * scene.filter_length,
-        blend_time=time * scene.blend_time,
         transient=time * scene.transient,
     )
 
 
 def optimised(length=1.0, mass=1.0, time=1.0):
     """An optimisation that its stop rule ends, in other units, and all designs."""
-    scene = small_scene(
-        steps=20, filter_length=2 / 16, blend_time=0.05, transient=2 * 4e-3, particles_per_cell=3
-    )
+    scene = small_scene(steps=20, filter_length=2 / 16, transient=2 * 4e-3, particles_per_cell=3)
     scene = scaled(scene, length, mass, time)
     stages = (
         Stage(0.5, 1e-2, 1e-3, 4e-3 * time),
@@ -170,7 +167,7 @@ def test_what_is_printed_of_a_small_robot_has_digits(tmp_path, capsys):
     are_told(re.findall(r"best L = (\S+)", repr(kept))[0], 1)
     assert commands.main(["postprocess", str(tmp_path / "run.h5")]) == 0
     are_told("\n".join(line.split("(gamma")[0] for line in capsys.readouterr().out.split("\n")), 3)
-    assert commands.main(["refine", str(tmp_path / "run.h5")]) == 0
+    assert commands.main(["study", str(tmp_path / "run.h5")]) == 0
     _, *lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 4
     for line in lines:

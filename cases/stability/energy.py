@@ -1,7 +1,6 @@
 """Energy from nowhere: what a run's balance shows where the method works, and where it does not."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -26,14 +25,14 @@ KICK = 1e-6  # velocity of a perturbation, in wave speeds
 Make = Callable[[], Simulation]
 
 
-def vibrating(blend: float, precision: Precision) -> Simulation:
+def vibrating(precision: Precision) -> Simulation:
     """The bar with an exact answer."""
-    return Bar(50, 0.5, precision=precision, blend_time=blend).simulation
+    return Bar(50, 0.5, precision=precision).simulation
 
 
-def grey(scene: Scene, blend: float, precision: Precision) -> Simulation:
+def grey(scene: Scene, precision: Precision) -> Simulation:
     """A random grey design of a scene; none if there is nothing to design."""
-    problem = Problem(replace(scene, blend_time=blend), 2.0, precision=precision)
+    problem = Problem(scene, 2.0, precision=precision)
     if problem.size == 0:
         return problem.simulation(np.zeros(0))
     phi = np.random.default_rng(1).uniform(-1.0, 1.0, problem.size - 3)
@@ -44,22 +43,15 @@ def resolved(quick: bool) -> Iterator[tuple[str, Make]]:
     """Motions that the method gets right."""
     precisions: tuple[Precision, ...] = ("double",) if quick else ("double", "single")
     for precision in precisions:
-        for blend in (0.0, 1e4):
-            yield (
-                f"bar vibrates, blend {blend:g}, {precision}",
-                partial(vibrating, blend, precision),
-            )
+        yield f"bar vibrates, {precision}", partial(vibrating, precision)
         drop = Scene(
             Grid((32, 32), 1 / 32), time_step=2e-3, steps=3000, gravity=(0.0, -10.0),
             body=(Solid((8 / 32, 10 / 32), (16 / 32, 16 / 32)),), walls=(Wall("y", 3 / 32),),
         )  # fmt: skip
-        for blend in (0.0, 2e-2, 1e3):
-            name = f"block bounces, blend {blend:g}, {precision}"
-            yield name, partial(grey, drop, blend, precision)
+        yield f"block bounces, {precision}", partial(grey, drop, precision)
         for name, scene in (("walker", walker(64, 8e-4)), ("crawler", crawler(64, 8e-4))):
-            for blend in (0.0, 2e-3):
-                make = partial(grey, scene.vary(void_density=1e-2), blend, precision)
-                yield f"{name}, grey, blend {blend:g}, {precision}", make
+            make = partial(grey, scene.vary(void_density=1e-2), precision)
+            yield f"{name}, grey, {precision}", make
 
 
 def block(courant: float, steps: int, kick: float) -> Simulation:

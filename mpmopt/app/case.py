@@ -32,7 +32,10 @@ from mpmopt.validation import digits, instance, place, shown
 
 logger = logging.getLogger(__name__)
 
-RESULTS = ("summary.json", "design.png", "history.png")  # besides run.h5
+# Besides run.h5; the last three of robots on ground.
+RESULTS = (
+    "summary.json", "design.png", "history.png", "stride.png", "gait.png", "robustness.png",
+)  # fmt: skip
 START = {"phi": 0.0, "a": 1.0, "theta": -0.3, "b": -0.5}
 
 
@@ -106,11 +109,13 @@ def run(
     checkpointing: Checkpointing | None = None,
     force: bool = False,
     phi: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None,
+    full_study: bool = False,
 ) -> dict[str, Any]:
     """Optimise a case and leave its results in a folder.
 
     Writes ``run.h5`` (before the first and after every evaluation), ``summary.json``,
-    ``design.png`` and ``history.png``. A folder that holds an unfinished run of this case is gone
+    ``design.png`` and ``history.png``; of a robot on ground also ``stride.png``, ``gait.png`` and
+    ``robustness.png``. A folder that holds an unfinished run of this case is gone
     on with; one that holds a finished one is left as it is.
 
     Parameters
@@ -123,6 +128,8 @@ def run(
         Begin anew and replace whatever the folder holds under those names.
     phi : callable, optional
         Of positions (D, 2): phi (D,) that a run begins with, instead of the case's.
+    full_study : bool, optional
+        Try the finished robot in all ways of `robustness.study`, not only in some.
 
     Returns
     -------
@@ -167,10 +174,10 @@ def run(
                     f"{path} holds an earlier run of another case; choose another folder, or "
                     "--force to replace it"
                 )
-            return _go_on(path, kept, checkpointing)
+            return _go_on(path, kept, checkpointing, full_study)
         refuse_existing((folder / name for name in RESULTS), force)
         runfile.write(path, new, baseline=baseline)
-        return _go_on(path, runfile.read_run(path), checkpointing)
+        return _go_on(path, runfile.read_run(path), checkpointing, full_study)
 
 
 def resume(
@@ -223,7 +230,10 @@ def baseline_particles(case: Case) -> dict[int, NDArray[np.bool_]]:
 
 
 def _go_on(
-    path: Path, kept: runfile.RunFile, checkpointing: Checkpointing | None
+    path: Path,
+    kept: runfile.RunFile,
+    checkpointing: Checkpointing | None,
+    full_study: bool = False,
 ) -> dict[str, Any]:
     if kept.summary:
         say(f"{path} holds a finished run.")
@@ -237,19 +247,24 @@ def _go_on(
         runfile.write(path, current, baseline=kept.baseline)
 
     result = go_on(kept.run, [save, ProgressBar()], checkpointing)
-    summary = summarise(result, kept.baseline)
+    summary = summarise(result, kept.baseline, full_study)
     text = json.dumps(summary, indent=1) + "\n"
     replace_file(path.parent / "summary.json", text.encode())
     runfile.write(path, result, summary, kept.baseline)
-    for name in RESULTS[1:]:
-        draw_or_warn(path.parent / name, lambda picture: _draw(picture, result))
+    drawn = RESULTS[1:] if "speed" in summary else RESULTS[1:3]
+    for name in drawn:
+        draw_or_warn(path.parent / name, lambda picture: _draw(picture, result, summary))
     return summary
 
 
-def _draw(path: Path, result: Optimisation) -> None:
+def _draw(path: Path, result: Optimisation, summary: Mapping[str, Any]) -> None:
+    from mpmopt.view.gait import plot_robustness
     from mpmopt.view.plot import PICTURES
 
-    PICTURES[path.stem](path, result)
+    if path.name == "robustness.png":
+        plot_robustness(path, summary)
+    else:
+        PICTURES[path.stem](path, result)
 
 
 def draw_or_warn(path: Path, draw: Callable[[Path], None]) -> None:

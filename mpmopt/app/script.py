@@ -56,13 +56,15 @@ def main(description: str, cases: Mapping[str, Case], argv: list[str] | None = N
     )
     arguments = parser.parse_args(argv)
     logging.basicConfig(format="%(message)s")
-    case = cases[getattr(arguments, "setting", None) or "default"]
+    setting = getattr(arguments, "setting", None) or "default"
+    case = cases[setting]
     out, force = arguments.out, arguments.force
     if arguments.starts is None:
         if arguments.scheduler:
             parser.error("--scheduler is for --starts: one run is one process")
         return reported(
-            lambda: print(table(run(case, out, force=force))), lambda: how_to_go_on(out / "run.h5")
+            lambda: print(table(run(case, out, force=force, full_study=setting == "default"))),
+            lambda: how_to_go_on(out / "run.h5"),
         )
     if arguments.starts < 1:
         parser.error(f"--starts {arguments.starts}: at least 1")

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mpmopt.assess import threshold
+from mpmopt.assess import robustness, threshold
 from mpmopt.assess.forces import books
 from mpmopt.assess.refinement import study
 from mpmopt.assess.threshold import (
@@ -28,8 +28,12 @@ from mpmopt.validation import digits, instance
 logger = logging.getLogger(__name__)
 
 
-def summarise(result: Optimisation, baseline: Mapping[int, NDArray[np.bool_]]) -> dict[str, Any]:
+def summarise(
+    result: Optimisation, baseline: Mapping[int, NDArray[np.bool_]], full: bool = False
+) -> dict[str, Any]:
     """Objective values (L, larger is farther), actuation and counts of a finished optimisation.
+
+    And the finished robot's `robustness.study`, in full or in short.
 
     The baseline is that of `baseline_particles`, or empty.
 
@@ -82,6 +86,7 @@ def summarise(result: Optimisation, baseline: Mapping[int, NDArray[np.bool_]]) -
             for row in rows
         },
         "retained_gain": {row.name: _number_or_none(row.retained) for row in others},
+        **robustness.study(problem, best.x, full),
         **_constraints(result),
         "non_discreteness": best.non_discreteness,
         "a": numbers(actuation.a),
@@ -124,12 +129,7 @@ def _shown(value: Any) -> str:
 
 def table(summary: Mapping[str, Any]) -> str:
     """The summary as aligned text."""
-    flat: dict[str, Any] = {}
-    for name, value in summary.items():
-        if isinstance(value, Mapping):
-            flat.update({f"{name}, {key}": item for key, item in value.items()})
-        else:
-            flat[name] = value
+    flat = _flat(summary)
     width = max(len(name) for name in flat)
     lines = []
     for name, value in flat.items():
@@ -137,3 +137,14 @@ def table(summary: Mapping[str, Any]) -> str:
         shown = ", ".join(_shown(v) for v in values)
         lines.append(f"{name.replace('_', ' '):<{width}}  {shown}")
     return "\n".join(lines)
+
+
+def _flat(values: Mapping[str, Any]) -> dict[str, Any]:
+    """The same without mappings in it: the names of what is in one have its name before them."""
+    flat: dict[str, Any] = {}
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            flat.update({f"{name}, {key}": item for key, item in _flat(value).items()})
+        else:
+            flat[name] = value
+    return flat

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from mpmopt.assess import threshold
 from mpmopt.assess.threshold import distance
 from mpmopt.design.problem import Problem
+from mpmopt.design.variation import refined
 from mpmopt.errors import SceneError, SimulationError
-from mpmopt.scene import Grid, Scene
+from mpmopt.scene import Scene
 from mpmopt.scene.particles import discretise, nearest_designed
 from mpmopt.validation import instance
 
@@ -48,21 +49,6 @@ class Variant:
     failure: str = ""
 
 
-def finer(scene: Scene) -> Scene:
-    """The scene with cells half as wide, at the same Courant number, for bodies without grey.
-
-    It has no design filter, which nothing needs that is laid out by `study`.
-    """
-    nx, ny = scene.grid.cells
-    return replace(
-        scene,
-        filter_length=0.0,
-        grid=Grid((2 * nx, 2 * ny), scene.grid.dx / 2.0),
-        time_step=scene.time_step / 2.0,
-        steps=2 * scene.steps,
-    )
-
-
 def least(problem: Problem, x: NDArray[np.float64]) -> float:
     """The lesser objective L of a design without its void with half the step or cells half as wide.
 
@@ -74,7 +60,7 @@ def least(problem: Problem, x: NDArray[np.float64]) -> float:
     scene = problem.scene
     return min(
         distance(there, mapped(there, problem, x), problem.split(x), problem.task)
-        for there in (scene.vary(time_step=scene.time_step / 2.0), finer(scene))
+        for there in (scene.vary(time_step=scene.time_step / 2.0), refined(scene, 2))
     )
 
 
@@ -126,7 +112,7 @@ def study(
         "as designed": lambda: scene,
         "half the step": lambda: scene.vary(time_step=scene.time_step / 2.0),
         "twice the step": lambda: scene.vary(time_step=scene.time_step * 2.0),
-        "cells half as wide": lambda: finer(scene),
+        "cells half as wide": lambda: refined(scene, 2),
     }
     rows: list[Variant] = []
     for name, make in variants.items():

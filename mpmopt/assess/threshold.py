@@ -9,13 +9,15 @@ from numpy.typing import NDArray
 from scipy.ndimage import label
 
 from mpmopt.design.actuation import signal
+from mpmopt.design.ensemble import side_by_side
 from mpmopt.design.problem import Problem, Variables
 from mpmopt.design.step_control import LIMITS, check_indicators
 from mpmopt.design.task import DEFAULT_TASK, Task
 from mpmopt.design.term import Outcome
+from mpmopt.design.variation import Variation
 from mpmopt.errors import DesignError, SimulationError
 from mpmopt.scene import Scene
-from mpmopt.scene.particles import discretise, of_solid
+from mpmopt.scene.particles import discretise, nearest_designed, of_solid
 from mpmopt.simulation.formulations import simulation_of
 from mpmopt.simulation.simulation import Simulation
 from mpmopt.validation import shown
@@ -76,7 +78,7 @@ def distance(
     variables: Variables,
     task: Task = DEFAULT_TASK,
 ) -> float:
-    """Objective L of a `solid_body`.
+    """Objective L of a `solid_body`, in all scenes of the task.
 
     Parameters
     ----------
@@ -92,10 +94,19 @@ def distance(
     SimulationError
         If the simulation fails, or goes beyond `SOLID_LIMITS`.
     """
-    simulation = solid_body(scene, keep, variables)
-    end = simulation.watch(task.maximise.instants(scene))
-    check_indicators(end.indicators, simulation, SOLID_LIMITS)
-    return float(task.maximise.value(Outcome(simulation, np.array(keep, float), end.states)))
+
+    def in_scene(variation: Variation) -> float:
+        there = variation.scene(scene)
+        mine = keep
+        if variation.refinement > 1:
+            mine = keep[nearest_designed(discretise(there), discretise(scene))]
+        simulation = solid_body(there, mine, variables)
+        end = simulation.watch(task.maximise.instants(there))
+        check_indicators(end.indicators, simulation, SOLID_LIMITS)
+        return float(task.maximise.value(Outcome(simulation, np.array(mine, float), end.states)))
+
+    values = side_by_side(in_scene, task.scenes or (Variation(),))
+    return float(task.soft(np.array(values))[0])
 
 
 def kept(problem: Problem, x: NDArray, threshold: float = THRESHOLD) -> NDArray[np.bool_]:

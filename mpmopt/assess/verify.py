@@ -124,13 +124,11 @@ def kernel_mismatches(scene: Scene, seed: int = 0) -> dict[str, float]:
         "g2p": (
             bench.g2p,
             bench.g2p_adjoint,
-            "position node_velocity" + " velocity" * (bench.fields == 2),
+            "position velocity affine_velocity node_velocity",
         ),
     }
     if scene.ground:
         tests["press"] = bench.press, bench.press_adjoint, "position stiffness"
-    if bench.fields == 2:
-        tests["inertia"] = bench.inertia, bench.inertia_adjoint, "affine_velocity mass"
     result = {
         name: dot_product_mismatch(
             function, adjoint, {key: bench.inputs[key] for key in keys.split()}, rng
@@ -212,19 +210,19 @@ class _Bench:
         if not inside:
             raise DesignError("a particle is outside the grid")
         self.window = tuple(window)
-        self.nodes, self.fields = window[2] * window[3], sample.fields
+        self.nodes = window[2] * window[3]
         affine = rng.standard_normal((4, count)) * np.mean(sample.data.mass) * speed
         self.inputs: Arrays = {
             **own._asdict(),
             **{name: kernels.ungrouped(getattr(self.data, name), 1, count) for name in DESIGNED},
             "signal": np.full(len(scene.actuators), 0.7),
             "affine": affine,
-            "node_velocity": speed * rng.standard_normal((self.fields, self.nodes, 2)),
+            "node_velocity": speed * rng.standard_normal((self.nodes, 2)),
         }
         grid = self.p2g(self.inputs)["grid"]
         self.mass_grid = grid[:, 2]
-        self.inputs["grid"] = np.stack(self.fields * [grid[grid[:, 2] > 0.0]])
-        self.inputs["normal_force"] = np.zeros(len(self.inputs["grid"][0]))
+        self.inputs["grid"] = grid[grid[:, 2] > 0.0]
+        self.inputs["normal_force"] = np.zeros(len(self.inputs["grid"]))
         if scene.ground:
             self.inputs["normal_force"] = self.press(self.inputs)["force"][self.mass_grid > 0.0]
 
@@ -235,7 +233,7 @@ class _Bench:
         return tile
 
     def _scratch(self, dtype: type) -> kernels.Scratch:
-        return kernels.Scratch.make(self.fields, self.nodes, 1, self.nodes, dtype)
+        return kernels.Scratch.make(self.nodes, 1, self.nodes, dtype)
 
     def _cells(self, nodes: NDArray) -> NDArray:
         """Taylor coefficients of a field on the nodes."""
@@ -326,21 +324,6 @@ class _Bench:
         gathered[:4] = affine_bar
         tile.gathered[:] = kernels.grouped(gathered, repeat=False)
 
-    def inertia(self, v: Arrays) -> Arrays:
-        dtype = np.result_type(*v.values()).type
-        state, data = self._state(v, dtype), self._data(v, dtype)
-        tile = self._tile(state)
-        kernels.inertia(state, data, self.parameters, tile, *self.all)
-        return {"affine": self._particles(tile.affine, 4) / self.parameters.dx}
-
-    def inertia_adjoint(self, v: Arrays, w: Arrays) -> Arrays:
-        state, data = self._state(v, float), self._data(v, float)
-        tile, bar, data_bar = self._tile(state), np.zeros_like(state), self._data_bar()
-        self._gather(tile, w["affine"])
-        kernels.inertia_adjoint(state, data, tile, bar, data_bar, *self.all)
-        affine_bar = self._parts(bar).affine_velocity
-        return {"affine_velocity": affine_bar, "mass": self._particles(data_bar.mass, 1)}
-
     def p2g(self, v: Arrays) -> Arrays:
         dtype = np.result_type(*v.values()).type
         state, data = self._state(v, dtype), self._data(v, dtype)
@@ -391,10 +374,10 @@ class _Bench:
         return {"position": self._parts(bar).position, "stiffness": stiffness}
 
     def _grid(self, v: Arrays, dtype: type) -> NDArray:
-        grid = np.zeros((self.fields, self.nodes, kernels.NODE_SIZE), dtype)
-        grid[:, self.mass_grid > 0.0, :3] = v["grid"]
+        grid = np.zeros((self.nodes, kernels.NODE_SIZE), dtype)
+        grid[self.mass_grid > 0.0, :3] = v["grid"]
         if "normal_force" in v:
-            grid[0, self.mass_grid > 0.0, 3] = v["normal_force"]
+            grid[self.mass_grid > 0.0, 3] = v["normal_force"]
         return grid
 
     def grid_update(self, v: Arrays) -> Arrays:
@@ -423,40 +406,27 @@ class _Bench:
                 scratch.node_bar,
                 column,
             )
-        node_bar = scratch.node_bar[:, self.mass_grid > 0.0]
-        result = {"grid": node_bar[..., :3], "normal_force": node_bar[0, :, 3]}
+        node_bar = scratch.node_bar[self.mass_grid > 0.0]
+        result = {"grid": node_bar[:, :3], "normal_force": node_bar[:, 3]}
         return {name: result[name] for name in v}
 
+    def _before_g2p(self, v: Arrays) -> tuple[NDArray, NDArray]:
+        dtype = np.result_type(*v.values()).type
+        return self._state(v, dtype), self._cells(v["node_velocity"].astype(dtype).ravel())
+
     def g2p(self, v: Arrays) -> Arrays:
-        """With the blend, if the scene has one."""
         old, cells = self._before_g2p(v)
         new, tile = np.zeros_like(old), self._tile(old)
-        kernels.g2p(old, new, self.parameters, tile, cells[0], *self.all)
-        if self.fields == 2:
-            kernels.blend(old, new, self.parameters, tile, cells[1], *self.all)
+        kernels.g2p(old, new, self.parameters, tile, cells, *self.all)
         x, v_new, C, _ = self._parts(new)
         return {"position": x, "velocity": v_new, "affine_velocity": C}
 
-    def _before_g2p(self, v: Arrays) -> tuple[NDArray, list[NDArray]]:
-        dtype = np.result_type(*v.values()).type
-        fields = v["node_velocity"].astype(dtype).reshape(self.fields, -1)
-        return self._state(v, dtype), [self._cells(field) for field in fields]
-
     def g2p_adjoint(self, v: Arrays, w: Arrays) -> Arrays:
         old, cells = self._before_g2p(v)
-        bar, tile = self._bar(**w), self._tile(old)
-        cells_bar = [np.zeros_like(each) for each in cells]
-        kernels.g2p_adjoint(self.parameters, tile, cells[0], cells_bar[0], bar, *self.all)
-        if self.fields == 2:
-            kernels.blend_adjoint(self.parameters, tile, cells[1], cells_bar[1], bar, *self.all)
-        found = self._parts(bar)
-        node_velocity = np.stack([self._nodes(each) for each in cells_bar])
-        result = {
-            "position": found.position,
-            "velocity": found.velocity,
-            "node_velocity": node_velocity.reshape(self.fields, -1, 2),
-        }
-        return {name: result[name] for name in v}
+        bar, tile, cells_bar = self._bar(**w), self._tile(old), np.zeros_like(cells)
+        kernels.g2p_adjoint(self.parameters, tile, cells, cells_bar, bar, *self.all)
+        found = {name: getattr(self._parts(bar), name) for name in v if name != "node_velocity"}
+        return {**found, "node_velocity": self._nodes(cells_bar).reshape(-1, 2)}
 
 
 def _log_jacobian(records: NDArray) -> NDArray:
@@ -522,7 +492,9 @@ def _settled(problem: Problem, x: NDArray[np.float64]) -> tuple[Problem, NDArray
         )
     evaluation = problem.evaluate(x)
     problem = problem.at(evaluation.time_step)
-    problem.halvings, problem.limits = 0, None
+    problem.halvings = 0
+    for each in (problem, *problem.members):
+        each.limits = None
     return problem, evaluation.gradients
 
 
@@ -563,19 +535,29 @@ def _complex_steps(
 
 def _derivatives(problem: Problem, x: NDArray[np.complex128]) -> tuple[NDArray, NDArray]:
     """Those of all terms (1 + m,) by the complex step, and the size of what each is a sum of."""
+    pairs = [_terms(member, x) for member in problem.members or (problem,)]
+    values, size = (np.array(part) for part in zip(*pairs))  # (S, 1 + m) each
+    value, weights = problem.task.soft(values[:, 0])
+    worst = values[:, 1:].real.argmax(axis=0), np.arange(1, values.shape[1])
+    exact = np.array([value, *values[worst]]).imag / COMPLEX_STEP
+    return exact, np.array([weights.real @ size[:, 0], *size[worst]])
+
+
+def _terms(problem: Problem, x: NDArray[np.complex128]) -> tuple[list[complex], list[float]]:
+    """Values of all terms in one scene, and the size of what the derivative of each is a sum of."""
     simulation = problem.simulation(x)
     states = simulation.watch(problem.task.instants(problem.scene)).states
     outcome = Outcome(simulation, problem.gamma(x), states)
     real_states = {step: state.real for step, state in states.items()}
     real = Outcome(problem.simulation(x.real), outcome.gamma.real, real_states)
-    exact, size = [], []
+    values, size = [], []
     for term in problem.task.terms:
         bars = term.adjoints(real)
         parts = [bar * states[step].imag for step, bar in bars.states.items()]
         parts += [bars.gamma * outcome.gamma.imag, bars.signal * simulation.signal.imag]
-        exact.append(np.imag(term.value(outcome)) / COMPLEX_STEP)
+        values.append(term.value(outcome))
         size.append(math.hypot(*(float(np.linalg.norm(part)) for part in parts)) / COMPLEX_STEP)
-    return np.array(exact), np.array(size)
+    return values, size
 
 
 class Taylor(NamedTuple):

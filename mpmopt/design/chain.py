@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +17,7 @@ from mpmopt.scene.particles import (
     Solids,
     discretise,
     mirror_images,
+    nearest_designed,
     own,
     solids,
 )
@@ -102,16 +104,32 @@ def filter_matrix(
     return (matrix @ scipy.sparse.csr_array((ones, (np.arange(image.size), image)), shape)).tocsr()
 
 
-def project(phi: NDArray, beta: float) -> NDArray:
-    """Smoothed Heaviside gamma = (tanh(beta phi) / tanh(beta) + 1) / 2."""
-    return 0.5 * (np.tanh(beta * phi) / np.tanh(beta) + 1.0)
+def project(phi: NDArray, beta: float, threshold: float = 0.5) -> NDArray:
+    """Smoothed Heaviside gamma, 0 at phi = -1 and 1 at phi = 1, steepest where (phi + 1) / 2 = eta.
+
+    The paper's gamma = (tanh(beta phi) / tanh(beta) + 1) / 2 at a threshold eta of 1/2; others
+    erode or dilate the design (Wang, Lazarov and Sigmund, 2011).
+    """
+    if threshold == 0.5:
+        return 0.5 * (np.tanh(beta * phi) / np.tanh(beta) + 1.0)
+    at, low, high = _edges(beta, threshold)
+    return (np.tanh(beta * (phi - at)) + low) / (low + high)
 
 
-def project_adjoint(phi: NDArray, beta: float, gamma_bar: NDArray) -> NDArray:
+def project_adjoint(
+    phi: NDArray, beta: float, gamma_bar: NDArray, threshold: float = 0.5
+) -> NDArray:
     """phi_bar from gamma_bar."""
-    decay = np.exp(-np.abs(beta * phi))
+    at, low, high = _edges(beta, threshold)
+    decay = np.exp(-np.abs(beta * (phi - at)))
     sech = 2.0 * decay / (1.0 + decay**2)  # 1 - tanh^2 = sech^2, which does not cancel
-    return gamma_bar * 0.5 * beta / np.tanh(beta) * sech**2
+    return gamma_bar * beta / (low + high) * sech**2
+
+
+def _edges(beta: float, threshold: float) -> tuple[float, float, float]:
+    """The threshold on the scale of phi, and tanh(beta x) for the ways x from the ends to it."""
+    at = 2.0 * threshold - 1.0
+    return at, float(np.tanh(beta * (1.0 + at))), float(np.tanh(beta * (1.0 - at)))
 
 
 def non_discreteness(gamma: NDArray) -> float:
@@ -130,6 +148,11 @@ class DesignChain:
     beta : float
         Sharpness of the projection, > 0.
 
+    Attributes
+    ----------
+    threshold : float
+        Of the projection.
+
     Raises
     ------
     DesignError
@@ -138,10 +161,26 @@ class DesignChain:
 
     def __init__(self, scene: Scene, particles: Particles, beta: float) -> None:
         self.beta = number("DesignChain", "beta", beta, above=0.0, error=DesignError)
+        self.threshold = 0.5
         self.filter = filter_matrix(scene, particles)
         self.designed = particles.designed
         self.solids = solids(scene, particles)
         self._last: Field | None = None
+
+    def varied(
+        self, threshold: float, scene: Scene, particles: Particles, own: Particles
+    ) -> DesignChain:
+        """This chain with another threshold, to the particles of another scene.
+
+        Those take the design from the nearest of this chain's `own`.
+        """
+        other = copy.copy(self)
+        other.threshold, other._last = threshold, None
+        if particles is not own:
+            other.filter = self.filter[nearest_designed(particles, own)]
+            other.designed = particles.designed
+        other.solids = solids(scene, particles)
+        return other
 
     def field(self, phi: NDArray) -> Field:
         """The material of a design phi (D,), real or complex.
@@ -154,7 +193,7 @@ class DesignChain:
         filtered = self.filter @ phi
         filtered = filtered - (filtered.real - np.clip(filtered.real, -1.0, 1.0))  # rounding
         gamma = np.ones(self.designed.size, dtype=np.result_type(phi, float))
-        gamma[self.designed] = project(filtered, self.beta)
+        gamma[self.designed] = project(filtered, self.beta, self.threshold)
         material = interpolate(self.solids, gamma)
         self._last = Field(self, phi, filtered, gamma[self.designed], *material)
         return self._last
@@ -194,7 +233,7 @@ class Field:
         chain = self.chain
         through = interpolate_adjoint(chain.solids, density_bar, stiffness_bar)
         gamma_bar = through[chain.designed] + gamma_bar
-        phi_bar = project_adjoint(self.filtered, chain.beta, gamma_bar)
+        phi_bar = project_adjoint(self.filtered, chain.beta, gamma_bar, chain.threshold)
         return chain.filter.T @ phi_bar
 
 

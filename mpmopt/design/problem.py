@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import dataclasses
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,9 +12,12 @@ from numpy.typing import NDArray
 
 from mpmopt.design.actuation import signal, signal_adjoint
 from mpmopt.design.chain import DesignChain
+from mpmopt.design.ensemble import side_by_side, together
+from mpmopt.design.evaluation import Evaluation
 from mpmopt.design.step_control import LIMITS, check_indicators, too_long, with_halvings
 from mpmopt.design.task import DEFAULT_TASK, Task
 from mpmopt.design.term import Adjoints, Outcome
+from mpmopt.design.variation import Variation
 from mpmopt.errors import DesignError
 from mpmopt.scene import Scene
 from mpmopt.scene.particles import discretise, nearest_designed
@@ -55,42 +57,6 @@ class Variables(NamedTuple):
         return cls(phi, *rest.reshape(3, -1))
 
 
-@dataclass(frozen=True)
-class Evaluation:
-    """A design evaluated, and how.
-
-    Attributes
-    ----------
-    value : float or complex
-        Objective L.
-    gradient : (D + 3 K,) array
-        Empty if only the value was asked for.
-    indicators : Indicators
-        Of the run that counts.
-    time_step : float
-        Of that run.
-    halved : int
-        How often the step was halved to get there.
-    constraints : (m,) array
-        Values of the constraints' terms, in the task's order.
-    jacobian : (m, D + 3 K) array
-        Their gradients; empty if only values were asked for.
-    """
-
-    value: Any
-    gradient: NDArray[np.float64]
-    indicators: Indicators
-    time_step: float
-    halved: int = 0
-    constraints: NDArray = field(default_factory=lambda: np.empty(0))
-    jacobian: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 0)))
-
-    @property
-    def gradients(self) -> NDArray[np.float64]:
-        """Those of the objective and of the constraints' terms (1 + m, D + 3 K)."""
-        return np.vstack([self.gradient, *self.jacobian])
-
-
 class Problem:
     """What a design achieves of a task in a scene, and which way to change it.
 
@@ -114,10 +80,12 @@ class Problem:
     precision : {"double", "single"}, optional
         Of the simulation (`Simulation`).
     task : Task, optional
-        Objective and constraints; default: the displacement.
+        Objective, constraints and scenes; default: the displacement in this one.
 
     Attributes
     ----------
+    members : tuple of Problem
+        The same design in each scene of the task; empty if it has one.
     particles : Particles
     chain : DesignChain
     size : int
@@ -143,7 +111,8 @@ class Problem:
     ) -> None:
         instance("Problem", "scene", scene, Scene)
         instance("Problem", "task", task, Task)
-        task.instants(scene)  # what makes no sense is told now
+        for variation in task.scenes or (Variation(),):
+            task.instants(variation.scene(scene))  # what makes no sense is told now
         self.task = task
         self.checkpointing = Checkpointing() if checkpointing is None else checkpointing
         instance("Problem", "checkpointing", self.checkpointing, Checkpointing)
@@ -159,6 +128,19 @@ class Problem:
         self.chain = DesignChain(scene, self.particles, beta)
         self._designed = int(self.particles.designed.sum())
         self.size = self._designed + 3 * len(scene.actuators)
+        self.members = tuple(self._member(variation) for variation in task.scenes)
+
+    def _member(self, variation: Variation) -> Problem:
+        """This problem in one scene of its task."""
+        member = copy.copy(self)
+        member.scene, member.task, member.members = variation.scene(self.scene), self.task.alone, ()
+        member._memories = []
+        if variation.refinement > 1:
+            member.particles = discretise(member.scene)
+        member.chain = self.chain.varied(
+            variation.threshold, member.scene, member.particles, self.particles
+        )
+        return member
 
     def join(self, phi: Any, a: Any, theta: Any, b: Any) -> NDArray[np.float64]:
         """The vector x of named variables; single numbers stand for all entries.
@@ -267,6 +249,8 @@ class Problem:
         """
         other = copy.copy(self)
         other.scene = self.scene.vary(time_step=time_step)
+        share = time_step / self.scene.time_step
+        other.members = tuple(each.at(share * each.scene.time_step) for each in self.members)
         return other
 
     def value(self, x: NDArray) -> Any:
@@ -279,11 +263,11 @@ class Problem:
         SimulationError
             If the simulation fails, or comes too close to it, in all time steps that are tried.
         """
-        return self._accepted(lambda problem: problem._value(x)).value
+        return self._evaluation(x, Problem._value).value
 
     def constraints(self, x: NDArray) -> NDArray:
         """Values (m,) of the constraints' terms, as `value`."""
-        return self._accepted(lambda problem: problem._value(x)).constraints
+        return self._evaluation(x, Problem._value).constraints
 
     def value_and_gradient(self, x: NDArray) -> tuple[float, NDArray[np.float64]]:
         """Objective L and its gradient (D + 3 K,), by the reverse loop.
@@ -307,11 +291,22 @@ class Problem:
             If checkpoints cannot be stored or read back.
         """
         x = _real("x", x)
-        return self._accepted(lambda problem: problem._value_and_gradient(x))
+        return self._evaluation(x, Problem._value_and_gradient)
 
-    def _accepted(self, evaluate: Callable[[Problem], Evaluation]) -> Evaluation:
-        evaluation, halved = with_halvings(self, evaluate, self.halvings)
-        return dataclasses.replace(evaluation, halved=halved)
+    def _evaluation(
+        self, x: NDArray, evaluate: Callable[[Problem, NDArray], Evaluation]
+    ) -> Evaluation:
+        """In all scenes of the task, each in a time step that is short enough."""
+
+        def accepted(problem: Problem) -> Evaluation:
+            evaluation, halved = with_halvings(problem, lambda p: evaluate(p, x), self.halvings)
+            return dataclasses.replace(evaluation, halved=halved)
+
+        if not self.members:
+            return accepted(self)
+        evaluation = together(self.task, side_by_side(accepted, self.members))
+        time_step = self.scene.time_step / 2.0**evaluation.halved
+        return dataclasses.replace(evaluation, time_step=time_step)
 
     def _value(self, x: NDArray) -> Evaluation:
         simulation = self.simulation(x)

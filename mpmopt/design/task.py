@@ -1,4 +1,4 @@
-"""What an optimisation does: an objective to maximise, and constraints."""
+"""What an optimisation does: an objective to maximise, constraints, and the scenes they hold in."""
 
 from __future__ import annotations
 
@@ -8,10 +8,14 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from mpmopt.design.term import Term
 from mpmopt.design.terms import TERMS, Displacement
+from mpmopt.design.variation import Variation
 from mpmopt.errors import DesignError
-from mpmopt.scene import Scene
+from mpmopt.scene import Ground, Scene
 from mpmopt.scene.parts import Checked
 from mpmopt.validation import instance, number, shown
 
@@ -52,7 +56,11 @@ class AtMost(Checked):
 
 @dataclass(frozen=True)
 class Task(Checked):
-    """An objective and constraints.
+    """An objective and constraints, in one scene or in an ensemble of scenes.
+
+    In an ensemble each scene has its own value L of the objective. What is maximised is their soft
+    minimum, -log(mean(exp(-k L))) / k, and a constraint holds in all scenes: its value is that of
+    the scene that meets it worst.
 
     Parameters
     ----------
@@ -60,11 +68,15 @@ class Task(Checked):
         Default: the displacement.
     subject_to : tuple of AtMost, optional
         Or a single one.
+    scenes : tuple of Variation, optional
+        The ensemble, by what differs from the scene; none: the scene as it is.
+    soft_minimum : float, optional
+        Sharpness k, in units of 1 / L: 0 is the mean, large ones tend to the worst scene.
 
     Raises
     ------
     DesignError
-        If one is no term, or no constraint.
+        If one is no term, no constraint or no scene, or the sharpness is negative.
 
     Examples
     --------
@@ -77,14 +89,24 @@ class Task(Checked):
 
     maximise: Term = field(default_factory=Displacement)
     subject_to: tuple[AtMost, ...] = ()
+    scenes: tuple[Variation, ...] = ()
+    soft_minimum: float = 0.0
 
     def __post_init__(self) -> None:
         instance("Task", "maximise", self.maximise, Term, "such as Displacement()")
-        given: Any = self.subject_to
-        constraints = tuple(given) if isinstance(given, Iterable) else (given,)
-        for constraint in constraints:
-            instance("Task", "subject_to", constraint, AtMost, "such as AtMost(Volume(), 0.4)")
-        self._set(subject_to=constraints)
+        for name, kind, such in (
+            ("subject_to", AtMost, "such as AtMost(Volume(), 0.4)"),
+            ("scenes", Variation, "such as Variation(friction=0.3)"),
+        ):
+            given: Any = getattr(self, name)
+            items = tuple(given) if isinstance(given, Iterable) else (given,)
+            for item in items:
+                instance("Task", name, item, kind, such)
+            self._set(**{name: items})
+        sharpness = number("Task", "soft_minimum", self.soft_minimum, error=DesignError)
+        if sharpness < 0.0:
+            raise DesignError(f"Task: soft_minimum = {sharpness:g} must not be negative")
+        self._set(soft_minimum=sharpness)
 
     @property
     def terms(self) -> tuple[Term, ...]:
@@ -94,6 +116,20 @@ class Task(Checked):
     def instants(self, scene: Scene) -> tuple[int, ...]:
         """Steps before the states that any term looks at, besides the last."""
         return tuple(sorted({step for term in self.terms for step in term.instants(scene)}))
+
+    @property
+    def alone(self) -> Task:
+        """The same in a single scene."""
+        return Task(self.maximise, self.subject_to)
+
+    def soft(self, values: NDArray) -> tuple[Any, NDArray]:
+        """The soft minimum of the objective's values in all scenes, and its derivatives by them."""
+        lowest = values[np.argmin(values.real)]
+        shares = np.exp(-self.soft_minimum * (values - lowest))
+        weights = shares / shares.sum()
+        if self.soft_minimum == 0.0:
+            return values.sum() / values.size, weights
+        return lowest - np.log(shares.sum() / values.size) / self.soft_minimum, weights
 
     def violation(self, values: Iterable[float]) -> float:
         """The largest g of constraints with these values, or 0 if all are met (`FEASIBLE`)."""
@@ -130,7 +166,7 @@ class Task(Checked):
 
 
 DEFAULT_TASK = Task()
-_KINDS = {kind.__name__: kind for kind in (Task, AtMost, *TERMS)}
+_KINDS = {kind.__name__: kind for kind in (Task, AtMost, Variation, Ground, *TERMS)}
 
 
 def _plain(value: Any) -> Any:

@@ -10,7 +10,6 @@ A step advances the particle states from t_n to t_n + dt (primes mark the new st
     mirror       adds the images across a plane of symmetry, if the scene has one
     grid_update  u_i = wall(resistance(q_i / m_i + dt g, dt f_i / m_i)), where m_i > 0
     g2p          v'  = sum_i w_ip u_i,  C' = c sum_i w_ip u_i (x_i - x)^T,  x' = x + dt v'
-    blend        v' += keep (v - sum_i w_ip u_i_old), if the scene asks for it
 
 Every kernel is followed by its adjoint of the same name, which uses the same variable names;
 ``_bar`` marks the derivative of the objective with respect to a variable. Branches (contact, cells)
@@ -92,8 +91,8 @@ from mpmopt.kernels.step import (
     advance,
     advance_adjoint,
 )
-from mpmopt.kernels.stress import inertia, inertia_adjoint, stress, stress_adjoint
-from mpmopt.kernels.transfer import blend, blend_adjoint, g2p, g2p_adjoint, p2g, p2g_adjoint
+from mpmopt.kernels.stress import stress, stress_adjoint
+from mpmopt.kernels.transfer import g2p, g2p_adjoint, p2g, p2g_adjoint
 
 __all__ = [
     "ABANDONED",
@@ -114,8 +113,6 @@ __all__ = [
     "Tile",
     "advance",
     "advance_adjoint",
-    "blend",
-    "blend_adjoint",
     "closest",
     "deform",
     "deform_adjoint",
@@ -133,8 +130,6 @@ __all__ = [
     "grips",
     "grouped",
     "indicators",
-    "inertia",
-    "inertia_adjoint",
     "interpolation",
     "kirchhoff",
     "locate",

@@ -51,7 +51,6 @@ class Parameters(NamedTuple):
     mirror_axis: int  # of the mirror plane's normal: 0 or 1; -1: no mirror
     mirror_node: int  # line of nodes that is the plane
     viscous: bool  # whether a material has a viscosity
-    keep: float  # share of what the grid smoothed away that particles keep; 0: no blend
     mass_tolerance: float  # mass of a node that is rounding of larger ones: the node is empty
 
 
@@ -124,41 +123,33 @@ def make_tile(groups, like):
 
 
 class Scratch(NamedTuple):
-    """What the threads share during a step, for B blocks and a window of M nodes.
+    """What the threads share during a step, for B blocks and a window of M nodes."""
 
-    There are S fields of nodes: one, or two where a scene blends. Then the second has the momentum
-    before force, gravity and walls, and its velocity.
-    """
-
-    velocity: NDArray  # (S, 2 M) u
-    velocity_bar: NDArray  # (S, 2 M)
-    node_bar: NDArray  # (S, M, 4) adjoints of momentum and mass
-    parts: NDArray  # (B, S, P, 4) what each block puts on the nodes of its own window
-    parts_bar: NDArray  # (B, S, 2 P) the same of `velocity_bar`
+    velocity: NDArray  # (2 M,) u
+    velocity_bar: NDArray  # (2 M,)
+    node_bar: NDArray  # (M, 4) adjoints of momentum and mass
+    parts: NDArray  # (B, P, 4) what each block puts on the nodes of its own window
+    parts_bar: NDArray  # (B, 2 P) the same of `velocity_bar`
     ends: NDArray[np.int64]  # (B, 2) how the step ended for each block, and a particle
 
     @classmethod
-    def make(
-        cls, fields: int, nodes: int, blocks: int, part: int, dtype: DTypeLike = float
-    ) -> "Scratch":
-        """Room for so many fields, nodes, blocks, and nodes of a block."""
+    def make(cls, nodes: int, blocks: int, part: int, dtype: DTypeLike = float) -> "Scratch":
+        """Room for so many nodes, blocks, and nodes of a block."""
         return cls(
-            np.zeros((fields, 2 * nodes), dtype),
-            np.zeros((fields, 2 * nodes), dtype),
-            np.zeros((fields, nodes, NODE_SIZE), dtype),
-            np.zeros((blocks, fields, part, NODE_SIZE), dtype),
-            np.zeros((blocks, fields, 2 * part), dtype),
+            np.zeros(2 * nodes, dtype),
+            np.zeros(2 * nodes, dtype),
+            np.zeros((nodes, NODE_SIZE), dtype),
+            np.zeros((blocks, part, NODE_SIZE), dtype),
+            np.zeros((blocks, 2 * part), dtype),
             np.zeros((blocks, 2), np.int64),
         )
 
 
 @jit
 def make_cells(scratch):
-    """Coefficients of the cells of any block, of records (S, 9 P, 4) and of pairs (S, 18 P)."""
-    _, fields, part, _ = scratch.parts.shape
-    dtype = scratch.parts.dtype
-    records = COEFFICIENTS * part
-    return np.zeros((fields, records, 4), dtype), np.zeros((fields, 2 * records), dtype)
+    """Coefficients of the cells of any block, of records (9 P, 4) and of pairs (18 P,)."""
+    records, dtype = COEFFICIENTS * scratch.parts.shape[1], scratch.parts.dtype
+    return np.zeros((records, 4), dtype), np.zeros(2 * records, dtype)
 
 
 @jit

@@ -59,6 +59,19 @@ def jit(function: Callable[..., Any]) -> Any:
     return _stamped(njit(**OPTIONS, forceinline=True)(function))
 
 
+def bare_jit(function: Callable[..., Any]) -> Any:
+    """As `jit`, for kernels that make no arrays: they count no references to those they take.
+
+    Counting costs more than a short kernel does whose tuples hold many arrays.
+    """
+    return _stamped(njit(**OPTIONS, forceinline=True, _nrt=False)(function))
+
+
+def bare_loop_jit(function: Callable[..., Any]) -> Any:
+    """As `bare_jit`, of a loop that stands by itself."""
+    return _stamped(njit(**OPTIONS, _nrt=False)(function))
+
+
 def plain(kernel: Any) -> Any:
     """A kernel as it is written, for numbers and arrays in Python."""
     return getattr(kernel, "py_func", kernel)

@@ -32,7 +32,7 @@ def mirror(records, window, parameters):
 
 
 @jit
-def add_blocks(parts, field, windows, window, a, nodes):
+def add_blocks(parts, windows, window, a, nodes):
     """Column a of the window: the sum of what the blocks put there, in their order."""
     i0, j0, _, nj = window
     for k in range(a * nj, (a + 1) * nj):
@@ -42,15 +42,15 @@ def add_blocks(parts, field, windows, window, a, nodes):
         if 0 <= column < windows[b, 2]:
             source, target = column * windows[b, 3], a * nj + windows[b, 1] - j0
             for k in range(windows[b, 3]):
-                add(nodes, target + k, load(parts[b, field], source + k))
+                add(nodes, target + k, load(parts[b], source + k))
 
 
 @jit
 def free_velocity(grid, node, per_m, parameters):
     """Velocity of a node from momentum, 1 / mass and gravity, before ground and walls."""
     return (
-        fused(grid[0, node, 0], per_m, parameters.dt * parameters.gravity_x),
-        fused(grid[0, node, 1], per_m, parameters.dt * parameters.gravity_y),
+        fused(grid[node, 0], per_m, parameters.dt * parameters.gravity_x),
+        fused(grid[node, 1], per_m, parameters.dt * parameters.gravity_y),
     )
 
 
@@ -63,24 +63,18 @@ def grid_update(grid, window, parameters, clamps, velocity, a):
     i0, j0, _, nj = window
     for b in range(nj):
         node = a * nj + b
-        m = grid[0, node, 2]
+        m = grid[node, 2]
         u = v = 0.0 * m
         if m.real > parameters.mass_tolerance:
             u, v = free_velocity(grid, node, 1.0 / m, parameters)
-            if grid[0, node, 3].real > 0.0:
-                push = parameters.dt * grid[0, node, 3] / m
+            if grid[node, 3].real > 0.0:
+                push = parameters.dt * grid[node, 3] / m
                 u, v = resistance(u, v, push, contact_at(parameters, i0 + a, j0 + b))
             u, v = wall(i0 + a, j0 + b, u, v, parameters)
             clamp = clamp_of(i0 + a, j0 + b, clamps, parameters.dx)
             if clamp >= 0:
                 u, v = clamps[clamp, 4] + 0.0 * m, clamps[clamp, 5] + 0.0 * m
-        velocity[0, 2 * node], velocity[0, 2 * node + 1] = u, v
-        if parameters.keep > 0.0:
-            u = v = 0.0 * m
-            if m.real > parameters.mass_tolerance:
-                per_m = 1.0 / grid[1, node, 2]
-                u, v = grid[1, node, 0] * per_m, grid[1, node, 1] * per_m
-            velocity[1, 2 * node], velocity[1, 2 * node + 1] = u, v
+        velocity[2 * node], velocity[2 * node + 1] = u, v
 
 
 @loop_jit
@@ -96,12 +90,12 @@ def grid_update_adjoint(grid, window, parameters, clamps, velocity_bar, node_bar
     i0, j0, _, nj = window
     for b in range(nj):
         node = a * nj + b
-        m = grid[0, node, 2]
+        m = grid[node, 2]
         if m > parameters.mass_tolerance:
             per_m = 1.0 / m
-            u, v = grid[0, node, 0] * per_m, grid[0, node, 1] * per_m
+            u, v = grid[node, 0] * per_m, grid[node, 1] * per_m
             free_u, free_v = held_u, held_v = free_velocity(grid, node, per_m, parameters)
-            push = parameters.dt * grid[0, node, 3] * per_m
+            push = parameters.dt * grid[node, 3] * per_m
             if push > 0.0 and len(parameters.walls) > 0:
                 contact = contact_at(parameters, i0 + a, j0 + b)
                 held_u, held_v = resistance(free_u, free_v, push, contact)
@@ -111,8 +105,8 @@ def grid_update_adjoint(grid, window, parameters, clamps, velocity_bar, node_bar
                 held_u,
                 held_v,
                 parameters,
-                velocity_bar[0, 2 * node],
-                velocity_bar[0, 2 * node + 1],
+                velocity_bar[2 * node],
+                velocity_bar[2 * node + 1],
             )
             push_bar = 0.0 * m
             if push > 0.0:
@@ -120,23 +114,12 @@ def grid_update_adjoint(grid, window, parameters, clamps, velocity_bar, node_bar
                 u_bar, v_bar, push_bar = resistance_adjoint(
                     free_u, free_v, push, contact, u_bar, v_bar
                 )
-            momentum_bar(node_bar[0], node, u, v, per_m, u_bar, v_bar)
-            node_bar[0, node, 2] -= push_bar * push * per_m
-            node_bar[0, node, 3] = push_bar * parameters.dt * per_m
+            node_bar[node, 0] = u_bar * per_m
+            node_bar[node, 1] = v_bar * per_m
+            node_bar[node, 2] = -fused(v_bar, v, u_bar * u) * per_m
+            node_bar[node, 2] -= push_bar * push * per_m
+            node_bar[node, 3] = push_bar * parameters.dt * per_m
             if clamp_of(i0 + a, j0 + b, clamps, parameters.dx) >= 0:
-                node_bar[0, node] = 0.0
-            if parameters.keep > 0.0:
-                per_m = 1.0 / grid[1, node, 2]
-                u, v = grid[1, node, 0] * per_m, grid[1, node, 1] * per_m
-                u_bar, v_bar = velocity_bar[1, 2 * node], velocity_bar[1, 2 * node + 1]
-                momentum_bar(node_bar[1], node, u, v, per_m, u_bar, v_bar)
+                node_bar[node] = 0.0
         else:
-            node_bar[:, node] = 0.0
-
-
-@jit
-def momentum_bar(node_bar, node, u, v, per_m, u_bar, v_bar):
-    """Adjoint of a velocity (u, v) = q / m, into a node's record."""
-    node_bar[node, 0] = u_bar * per_m
-    node_bar[node, 1] = v_bar * per_m
-    node_bar[node, 2] = -fused(v_bar, v, u_bar * u) * per_m
+            node_bar[node] = 0.0

@@ -1,8 +1,13 @@
 """Total Lagrangian steps: a body on the lattice of its own reference configuration.
 
 Nodes are control points of quadratic B-splines, of which the cells are the spans; particles are
-quadrature points at fixed places in their cells. Fields on nodes are polynomials of cells
-(`kernels.spline`), so all that depends on a particle's place are the constants of a `pattern`.
+quadrature points at fixed places in their cells, n x n in each. A step goes along the rows of cells,
+four neighbours at a time: of each cell the same particle. Sums over the nine nodes of a cell are
+taken across the row first, then along it.
+
+A row of nodes has `width` numbers, one for each node and some that stand for none. Node i of row j
+has number j width + i; the nodes of cell (i, j) are (i, j) to (i + 2, j + 2). The state (4, M) of
+the nodes are their x_x, x_y, v_x, v_y.
 """
 
 import math
@@ -12,8 +17,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from mpmopt.kernels.actuation import second_piola
-from mpmopt.kernels.arrays import COEFFICIENTS, clear
-from mpmopt.kernels.compiler import jit, loop_jit
+from mpmopt.kernels.compiler import bare_jit, bare_loop_jit, jit, loop_jit
 from mpmopt.kernels.ground import (
     CREEPING,
     DAMPING,
@@ -28,43 +32,52 @@ from mpmopt.kernels.material import solid_constants
 from mpmopt.kernels.simd import (
     above,
     add,
+    add_four,
     chosen,
+    four,
+    greatest,
     load,
     logarithm,
-    number,
-    pack,
+    nothing,
+    put_four,
+    real,
     reciprocal,
     total,
+    within,
 )
-from mpmopt.kernels.spline import taylor, taylor_adjoint
 
 # Below this J the logarithm goes on as its Taylor polynomial of order two, so that void may invert.
 LEAST_J = 0.25
-# Records of a pattern for a group: 6 of the derivative along x (orders (1, 0), (2, 0), (1, 1),
-# (2, 1), (1, 2), (2, 2) of a cell's polynomial), 6 along y (x and y exchanged), 9 of the value.
-PATTERN_SIZE, VALUE = 21, 12
-# Cells whose middle is farther than this from the layers, in cells, have no particle in them.
-CLEAR = 3.0
+# Zeros before and after a row of stresses, which nodes beside its cells take their share of.
+MARGIN = 4
+# Cells are asked anew whether they are near a layer when a node may have moved so many cells.
+SKIN = 1.0
 
 
 class Lattice(NamedTuple):
-    """A body on its reference lattice of A by B cells, R groups of four particles in each."""
+    """A body on its reference lattice: B rows of cells, A groups of four in each.
+
+    A group has n x n records of particles, one of each of its cells: V in all, of which
+    ((j n + b) n + a) A + g is that of group g of row j, a-th along x and b-th along y.
+    """
 
     dt: float
     dx: float
     gravity_x: float
     gravity_y: float
-    columns: int  # A
+    columns: int  # of cells, of which the last group may have less than four
+    groups: int  # A
     rows: int  # B
     volume: float  # of a particle
     viscous: bool  # whether any viscosity is above zero
     mirror_axis: int  # of the mirror plane's normal, 0 or 1: it bounds the cells; -1: no mirror
-    pattern: NDArray[np.float64]  # (21 R, 4), as `pattern` makes it
-    constants: NDArray[np.float64]  # (P, A B R, 4) of the solid, as `kernels.material` names them
-    stiffness: NDArray  # (A B R, 4) share of the solid's, zero where no particle is
-    filled: NDArray[np.bool_]  # (A B,) whether a cell has particles
-    actuated: NDArray[np.float64]  # (K, A B R, 4) 1 for the particles of actuator k, else 0
-    active: NDArray[np.bool_]  # (A B R,) whether a group has actuated particles
+    weights: NDArray[np.float64]  # (n, 6), as `weights` makes it
+    constants: NDArray[np.float64]  # (P, V, 4) of the solid; or (P, 1, 4), where all are alike
+    varied: int  # 1; or 0, where all are alike
+    stiffness: NDArray  # (V, 4) share of the solid's, zero where no particle is
+    filled: NDArray[np.bool_]  # (A B,) whether a group of cells has particles
+    actuated: NDArray[np.float64]  # (K, V, 4) 1 for the particles of actuator k, else 0
+    active: NDArray[np.bool_]  # (V,) whether a record has actuated particles
     actuation_stress: NDArray[np.float64]  # (K, 3) second Piola-Kirchhoff S: xx, xy, yy
     mass: NDArray  # (M,) of the nodes, lumped
     ground: Any  # `kernels.ground.Ground`
@@ -73,9 +86,9 @@ class Lattice(NamedTuple):
 
 
 class LatticeBar(NamedTuple):
-    """Adjoints of `Lattice`, accumulated over the steps, and of the signal."""
+    """Adjoints of `Lattice`, accumulated over the steps."""
 
-    stiffness: NDArray  # (A B R, 4)
+    stiffness: NDArray  # (V, 4)
     mass: NDArray  # (M,)
 
     @classmethod
@@ -84,79 +97,107 @@ class LatticeBar(NamedTuple):
         return cls(np.zeros(lattice.stiffness.shape, dtype), np.zeros(lattice.mass.shape, dtype))
 
 
+class Rows(NamedTuple):
+    """What a step derives of one row of cells at a time: small, to stay in fast memory."""
+
+    values: NDArray  # (fields, width) sums across the row, by the splines' values
+    slopes: NDArray  # (fields, width) and by their slopes
+    stress: NDArray  # (fields, 2, n, MARGIN + width) by x and y, and place along x, of its particles
+
+
+@bare_jit
+def width_of(lattice):
+    """Numbers in a row of nodes: the last group's cells touch two nodes beyond it."""
+    return 4 * lattice.groups + 4
+
+
 @jit
-def slopes_x(cells, c, lane, pattern, r):
-    """Derivative along x of a field, one lane of the cell's records, at four particles."""
-    return (
-        load(pattern, PATTERN_SIZE * r) * number(cells, c + 3, lane)
-        + load(pattern, PATTERN_SIZE * r + 1) * number(cells, c + 6, lane)
-        + load(pattern, PATTERN_SIZE * r + 2) * number(cells, c + 4, lane)
-        + load(pattern, PATTERN_SIZE * r + 3) * number(cells, c + 7, lane)
-        + load(pattern, PATTERN_SIZE * r + 4) * number(cells, c + 5, lane)
-        + load(pattern, PATTERN_SIZE * r + 5) * number(cells, c + 8, lane)
+def make_rows(fields, stressed, lattice):
+    """Room for a row of so many fields, and so many components that have stresses."""
+    n, width, dtype = len(lattice.weights), width_of(lattice), lattice.stiffness.dtype
+    return Rows(
+        np.zeros((fields, width), dtype),
+        np.zeros((fields, width), dtype),
+        np.zeros((stressed, 2, n, MARGIN + width), dtype),
     )
 
 
-@jit
-def slopes_y(cells, c, lane, pattern, r):
-    """Derivative along y of a field, one lane of the cell's records, at four particles."""
+@bare_jit
+def across(nodes, first, b, scale, lattice, rows, field):
+    """Sums of a field over the three rows of nodes of a row of cells, at b-th particles along y.
+
+    `first` is the place of its first node in `nodes`; the sums are times a scale.
+    """
+    width, w = width_of(lattice), lattice.weights
+    n0, n1, n2 = scale * w[b, 0], scale * w[b, 1], scale * w[b, 2]
+    g0, g1, g2 = scale * w[b, 3], scale * w[b, 4], scale * w[b, 5]
+    for i in range(0, width, 4):
+        u0 = four(nodes, first + i)
+        u1 = four(nodes, first + width + i)
+        u2 = four(nodes, first + 2 * width + i)
+        put_four(rows.values, field * width + i, n0 * u0 + n1 * u1 + n2 * u2)
+        put_four(rows.slopes, field * width + i, g0 * u0 + g1 * u1 + g2 * u2)
+
+
+@bare_jit
+def along(sums, place, w0, w1, w2):
+    """Sum over the three nodes along x of the cells of a group."""
+    return w0 * four(sums, place) + w1 * four(sums, place + 1) + w2 * four(sums, place + 2)
+
+
+@bare_jit
+def gradient(rows, field, i, a, lattice):
+    """Gradient (00, 01, 10, 11) of a vector field at a-th particles along x of cells from i on."""
+    w, width = lattice.weights, width_of(lattice)
+    n0, n1, n2, g0, g1, g2 = w[a, 0], w[a, 1], w[a, 2], w[a, 3], w[a, 4], w[a, 5]
+    x, y = field * width + i, (field + 1) * width + i
     return (
-        load(pattern, PATTERN_SIZE * r + 6) * number(cells, c + 1, lane)
-        + load(pattern, PATTERN_SIZE * r + 7) * number(cells, c + 2, lane)
-        + load(pattern, PATTERN_SIZE * r + 8) * number(cells, c + 4, lane)
-        + load(pattern, PATTERN_SIZE * r + 9) * number(cells, c + 5, lane)
-        + load(pattern, PATTERN_SIZE * r + 10) * number(cells, c + 7, lane)
-        + load(pattern, PATTERN_SIZE * r + 11) * number(cells, c + 8, lane)
+        along(rows.values, x, g0, g1, g2),
+        along(rows.slopes, x, n0, n1, n2),
+        along(rows.values, y, g0, g1, g2),
+        along(rows.slopes, y, n0, n1, n2),
     )
 
 
-@jit
-def gradients(cells, c, first, pattern, r):
-    """Gradient (00, 01, 10, 11) of the vector field in lanes `first` and `first` + 1."""
-    return (
-        slopes_x(cells, c, first, pattern, r),
-        slopes_y(cells, c, first, pattern, r),
-        slopes_x(cells, c, first + 1, pattern, r),
-        slopes_y(cells, c, first + 1, pattern, r),
-    )
-
-
-@jit
-def gradient_adjoint(moments, c, pattern, r, P):
-    """Adds to lanes 0 and 1 of a cell's moments what `gradients` transposed gives of P."""
+@bare_jit
+def put_stress(rows, field, i, a, lattice, P):
+    """Write what `gradient_adjoint` takes, of a-th particles along x of cells from i on."""
+    n = len(lattice.weights)
+    length = MARGIN + width_of(lattice)
+    place = (2 * field * n + a) * length + MARGIN + i
     p00, p01, p10, p11 = P
-    for k in range(6):
-        w = load(pattern, PATTERN_SIZE * r + k)
-        order = c + (k % 2 + 1) * 3 + k // 2
-        moments[order, 0] += total(w * p00)
-        moments[order, 1] += total(w * p10)
-    for k in range(6):
-        w = load(pattern, PATTERN_SIZE * r + 6 + k)
-        order = c + (k // 2) * 3 + k % 2 + 1
-        moments[order, 0] += total(w * p01)
-        moments[order, 1] += total(w * p11)
+    put_four(rows.stress, place, p00)
+    put_four(rows.stress, place + n * length, p01)
+    put_four(rows.stress, place + 2 * n * length, p10)
+    put_four(rows.stress, place + 3 * n * length, p11)
 
 
-@jit
-def gradients_adjoint(moments, c, pattern, r, P, Q):
-    """Adds to a cell's moments what `gradients` transposed gives of P in lanes 0, 1, Q in 2, 3."""
-    p00, p01, p10, p11 = P
-    q00, q01, q10, q11 = Q
-    for k in range(6):
-        w = load(pattern, PATTERN_SIZE * r + k)
-        order = (k % 2 + 1) * 3 + k // 2
-        add(
-            moments, c + order, pack(total(w * p00), total(w * p10), total(w * q00), total(w * q10))
-        )
-    for k in range(6):
-        w = load(pattern, PATTERN_SIZE * r + 6 + k)
-        order = (k // 2) * 3 + k % 2 + 1
-        add(
-            moments, c + order, pack(total(w * p01), total(w * p11), total(w * q01), total(w * q11))
-        )
+@bare_jit
+def gradient_adjoint(rows, fields, b, scale, lattice, nodes, first):
+    """Adds to the fields of nodes what `gradient` and `across` transposed give of the stresses.
+
+    `first` is the place of the row's first node in `nodes`, of which each field has M.
+    """
+    width, w, n, M = width_of(lattice), lattice.weights, len(lattice.weights), len(lattice.mass)
+    length = MARGIN + width
+    n0, n1, n2 = scale * w[b, 0], scale * w[b, 1], scale * w[b, 2]
+    g0, g1, g2 = scale * w[b, 3], scale * w[b, 4], scale * w[b, 5]
+    for field in range(fields):
+        for i in range(0, width, 4):
+            x = 2 * field * n * length + MARGIN + i
+            by_value = by_slope = nothing(rows.values)
+            for a in range(n):
+                y = x + n * length
+                by_value = by_value + along(rows.stress, x - 2, w[a, 5], w[a, 4], w[a, 3])
+                by_slope = by_slope + along(rows.stress, y - 2, w[a, 2], w[a, 1], w[a, 0])
+                x += length
+            node = field * M + first + i
+            add_four(nodes, node, n0 * by_value + g0 * by_slope)
+            add_four(nodes, node + width, n1 * by_value + g1 * by_slope)
+            add_four(nodes, node + 2 * width, n2 * by_value + g2 * by_slope)
 
 
-@jit
+@bare_jit
 def continued(J):
     """ln J and its first and second derivative, continued below `LEAST_J`."""
     inside = above(J, LEAST_J)
@@ -168,7 +209,7 @@ def continued(J):
     return log + off * slope - 0.5 * off * off * bend, slope - off * bend, 0.0 * J - bend
 
 
-@jit
+@bare_jit
 def solid_stress(F, rate, constants, viscous):
     """First Piola-Kirchhoff stress P of the solid at F and its rate of change (00, 01, 10, 11).
 
@@ -189,7 +230,7 @@ def solid_stress(F, rate, constants, viscous):
     return p00, p01, p10, p11
 
 
-@jit
+@bare_jit
 def solid_stress_adjoint(F, rate, constants, viscous, P_bar):
     """F_bar and the adjoint of the rate from P_bar: the transpose of `solid_stress`."""
     f00, f01, f10, f11 = F
@@ -219,162 +260,219 @@ def solid_stress_adjoint(F, rate, constants, viscous, P_bar):
     return (b00, b01, b10, b11), (r00, r01, r10, r11)
 
 
-@jit
-def forces(cells, moments, lattice, signal):
-    """Moments of the internal force - sum V P G of all cells, from the polynomials of (x, v)."""
-    groups, pattern = lattice.pattern.shape[0] // PATTERN_SIZE, lattice.pattern
-    for cell in range(lattice.columns * lattice.rows):
-        if lattice.filled[cell]:
-            c = COEFFICIENTS * cell
-            for r in range(groups):
-                g = cell * groups + r
-                F = gradients(cells, c, 0, pattern, r)
-                rate = F  # which nothing asks for
-                if lattice.viscous:
-                    rate = gradients(cells, c, 2, pattern, r)
-                p00, p01, p10, p11 = solid_stress(
-                    F, rate, solid_constants(lattice, g), lattice.viscous
-                )
-                share = -lattice.volume * load(lattice.stiffness, g)
-                p00, p01, p10, p11 = share * p00, share * p01, share * p10, share * p11
-                if lattice.active[g]:
-                    f00, f01, f10, f11 = F
-                    s00, s01, s11 = second_piola(lattice, g, signal)
-                    V = lattice.volume
-                    p00, p01 = p00 - V * (f00 * s00 + f01 * s01), p01 - V * (f00 * s01 + f01 * s11)
-                    p10, p11 = p10 - V * (f10 * s00 + f11 * s01), p11 - V * (f10 * s01 + f11 * s11)
-                gradient_adjoint(moments, c, pattern, r, (p00, p01, p10, p11))
+@bare_jit
+def stress(rows, r, i, a, lattice, signal):
+    """First Piola-Kirchhoff stress P of record r: a-th particles along x of cells from i on."""
+    F = gradient(rows, 0, i, a, lattice)
+    rate = F  # which nothing asks for
+    if lattice.viscous:
+        rate = gradient(rows, 2, i, a, lattice)
+    constants = solid_constants(lattice, lattice.varied * r)
+    p00, p01, p10, p11 = solid_stress(F, rate, constants, lattice.viscous)
+    k = load(lattice.stiffness, r)
+    p00, p01, p10, p11 = k * p00, k * p01, k * p10, k * p11
+    if lattice.active[r]:
+        f00, f01, f10, f11 = F
+        s00, s01, s11 = second_piola(lattice, r, signal)
+        p00, p01 = p00 + f00 * s00 + f01 * s01, p01 + f00 * s01 + f01 * s11
+        p10, p11 = p10 + f10 * s00 + f11 * s01, p11 + f10 * s01 + f11 * s11
+    return p00, p01, p10, p11
 
 
-@jit
-def forces_adjoint(cells, cells_bar, moments, lattice, signal, bar, signal_bar):
-    """From f_bar, of which `cells_bar` are the polynomials, to moments of x_bar and v_bar.
+@bare_jit
+def stress_adjoint(rows, r, i, a, lattice, signal, bar, signal_bar):
+    """F_bar and the adjoint of its rate from P_bar, the gradient of the rows' fields 4 and 5.
 
     Adds to the adjoints of stiffness and signal.
     """
-    groups, pattern = lattice.pattern.shape[0] // PATTERN_SIZE, lattice.pattern
-    V = lattice.volume
-    for cell in range(lattice.columns * lattice.rows):
-        if lattice.filled[cell]:
-            c = COEFFICIENTS * cell
-            for r in range(groups):
-                g = cell * groups + r
-                F = gradients(cells, c, 0, pattern, r)
-                rate = gradients(cells, c, 2, pattern, r)
-                q00, q01, q10, q11 = gradients(cells_bar, c, 0, pattern, r)
-                q00, q01, q10, q11 = -V * q00, -V * q01, -V * q10, -V * q11
-                p00, p01, p10, p11 = solid_stress(
-                    F, rate, solid_constants(lattice, g), lattice.viscous
-                )
-                add(bar.stiffness, g, q00 * p00 + q01 * p01 + q10 * p10 + q11 * p11)
-                k = load(lattice.stiffness, g)
-                P_bar = k * q00, k * q01, k * q10, k * q11
-                F_bar, rate_bar = solid_stress_adjoint(
-                    F, rate, solid_constants(lattice, g), lattice.viscous, P_bar
-                )
-                if lattice.active[g]:
-                    f00, f01, f10, f11 = F
-                    b00, b01, b10, b11 = F_bar
-                    s00, s01, s11 = second_piola(lattice, g, signal)
-                    b00, b01 = b00 + q00 * s00 + q01 * s01, b01 + q00 * s01 + q01 * s11
-                    b10, b11 = b10 + q10 * s00 + q11 * s01, b11 + q10 * s01 + q11 * s11
-                    F_bar = b00, b01, b10, b11
-                    m00, m11 = f00 * q00 + f10 * q10, f01 * q01 + f11 * q11
-                    m01 = f00 * q01 + f10 * q11 + f01 * q00 + f11 * q10
-                    for a in range(signal.size):
-                        power = (
-                            lattice.actuation_stress[a, 0] * m00
-                            + lattice.actuation_stress[a, 1] * m01
-                            + lattice.actuation_stress[a, 2] * m11
+    F = gradient(rows, 0, i, a, lattice)
+    rate = F
+    if lattice.viscous:
+        rate = gradient(rows, 2, i, a, lattice)
+    q00, q01, q10, q11 = gradient(rows, 4, i, a, lattice)
+    constants = solid_constants(lattice, lattice.varied * r)
+    p00, p01, p10, p11 = solid_stress(F, rate, constants, lattice.viscous)
+    add(bar.stiffness, r, q00 * p00 + q01 * p01 + q10 * p10 + q11 * p11)
+    k = load(lattice.stiffness, r)
+    P_bar = k * q00, k * q01, k * q10, k * q11
+    F_bar, rate_bar = solid_stress_adjoint(F, rate, constants, lattice.viscous, P_bar)
+    if lattice.active[r]:
+        f00, f01, f10, f11 = F
+        b00, b01, b10, b11 = F_bar
+        s00, s01, s11 = second_piola(lattice, r, signal)
+        b00, b01 = b00 + q00 * s00 + q01 * s01, b01 + q00 * s01 + q01 * s11
+        b10, b11 = b10 + q10 * s00 + q11 * s01, b11 + q10 * s01 + q11 * s11
+        F_bar = b00, b01, b10, b11
+        m00, m11 = f00 * q00 + f10 * q10, f01 * q01 + f11 * q11
+        m01 = f00 * q01 + f10 * q11 + f01 * q00 + f11 * q10
+        for each in range(signal.size):
+            S = lattice.actuation_stress[each]
+            power = S[0] * m00 + S[1] * m01 + S[2] * m11
+            signal_bar[each] += total(load(lattice.actuated[each], r) * power)
+    return F_bar, rate_bar
+
+
+@bare_jit
+def forces(state, lattice, signal, rows, force):
+    """Adds the internal force - sum V P G to the nodes' f_x and f_y."""
+    n, M, width = len(lattice.weights), len(lattice.mass), width_of(lattice)
+    none = nothing(rows.values)
+    for j in range(lattice.rows):
+        for b in range(n):
+            for field in range(4 if lattice.viscous else 2):
+                across(state, field * M + j * width, b, 1.0, lattice, rows, field)
+            for a in range(n):
+                for g in range(lattice.groups):
+                    P = none, none, none, none
+                    if lattice.filled[j * lattice.groups + g]:
+                        r = ((j * n + b) * n + a) * lattice.groups + g
+                        P = stress(rows, r, 4 * g, a, lattice, signal)
+                    put_stress(rows, 0, 4 * g, a, lattice, P)
+            gradient_adjoint(rows, 2, b, -lattice.volume, lattice, force, j * width)
+
+
+@bare_jit
+def forces_adjoint(state, force_bar, lattice, signal, rows, state_bar, bar, signal_bar):
+    """From f_bar: adds to x_bar and v_bar of the nodes, to adjoints of stiffness and signal."""
+    n, M, width = len(lattice.weights), len(lattice.mass), width_of(lattice)
+    none = nothing(rows.values)
+    fields = 4 if lattice.viscous else 2
+    for j in range(lattice.rows):
+        for b in range(n):
+            for field in range(fields):
+                across(state, field * M + j * width, b, 1.0, lattice, rows, field)
+            for field in range(2):
+                first = field * M + j * width
+                across(force_bar, first, b, -lattice.volume, lattice, rows, 4 + field)
+            for a in range(n):
+                for g in range(lattice.groups):
+                    F_bar = rate_bar = none, none, none, none
+                    if lattice.filled[j * lattice.groups + g]:
+                        r = ((j * n + b) * n + a) * lattice.groups + g
+                        F_bar, rate_bar = stress_adjoint(
+                            rows, r, 4 * g, a, lattice, signal, bar, signal_bar
                         )
-                        signal_bar[a] += total(load(lattice.actuated[a], g) * power)
-                gradients_adjoint(moments, c, pattern, r, F_bar, rate_bar)
+                    put_stress(rows, 0, 4 * g, a, lattice, F_bar)
+                    put_stress(rows, 2, 4 * g, a, lattice, rate_bar)
+            gradient_adjoint(rows, fields, b, 1.0, lattice, state_bar, j * width)
 
 
-@jit
-def value(cells, c, lane, pattern, r, k):
-    """A field, one lane of the cell's records, at particle k of a group."""
-    result = 0.0 * cells[c, lane]
-    for order in range(COEFFICIENTS):
-        result += pattern[PATTERN_SIZE * r + VALUE + order, k] * cells[c + order, lane]
-    return result
+@bare_jit
+def value(nodes, first, a, b, lattice):
+    """A field of nodes at particles (a, b) of a group of cells, whose first node is at `first`."""
+    w, width = lattice.weights, width_of(lattice)
+    n0, n1, n2 = w[a, 0], w[a, 1], w[a, 2]
+    return (
+        w[b, 0] * along(nodes, first, n0, n1, n2)
+        + w[b, 1] * along(nodes, first + width, n0, n1, n2)
+        + w[b, 2] * along(nodes, first + 2 * width, n0, n1, n2)
+    )
 
 
-@jit
-def is_clear(cells, c, lattice):
-    """Whether the cell is too far from ground to touch it."""
-    i = round(float(cells[c, 0].real) / lattice.dx)
-    j = round(float(cells[c, 1].real) / lattice.dx)
+@bare_jit
+def value_adjoint(field, first, a, b, lattice, bar):
+    """Adds to one field (M,) of nodes what the value `bar` at a particle gives them."""
+    w, width = lattice.weights, width_of(lattice)
+    for row in range(3):
+        for k in range(3):
+            field[first + row * width + k] += w[b, row] * w[a, k] * bar
+
+
+@bare_jit
+def is_clear(x, y, lattice):
+    """Whether a particle at (x, y) stays off the layers until it has moved by `SKIN` cells."""
+    i, j = int(math.floor(x / lattice.dx + 0.5)), int(math.floor(y / lattice.dx + 0.5))
     if not (0 <= i < lattice.nodes_x and 0 <= j < lattice.nodes_y):
         return False
-    return lattice.ground.clearance[i * lattice.nodes_y + j] > CLEAR * lattice.dx
+    # No distance from that node is more than 0.71 cells, and none changes by more than one goes.
+    return lattice.ground.clearance[i * lattice.nodes_y + j] > (SKIN + 0.75) * lattice.dx
 
 
-@jit
-def press(cells, moments, lattice):
-    """Adds the layers' force b n and its size b, in lanes 0 to 2, to the moments of all cells."""
-    groups, pattern = lattice.pattern.shape[0] // PATTERN_SIZE, lattice.pattern
+@bare_jit
+def find_near(state, lattice, near):
+    """Which groups of cells (A B,) have a particle that the layers are near to."""
+    n, M, width = len(lattice.weights), len(lattice.mass), width_of(lattice)
+    for group in range(len(near)):
+        near[group] = False
+        if lattice.filled[group]:
+            first = group // lattice.groups * width + 4 * (group % lattice.groups)
+            for b in range(n):
+                for a in range(n):
+                    x = real(value(state, first, a, b, lattice))
+                    y = real(value(state, M + first, a, b, lattice))
+                    for k in range(4):
+                        if not is_clear(x[k], y[k], lattice):
+                            near[group] = True
+
+
+@bare_jit
+def press(state, lattice, near, force):
+    """Adds the layers' force b n and its size b to the nodes' f_x, f_y and f_N."""
+    n, M, width = len(lattice.weights), len(lattice.mass), width_of(lattice)
     layers = lattice.ground.layers
-    for cell in range(lattice.columns * lattice.rows):
-        c = COEFFICIENTS * cell
-        if lattice.filled[cell] and not is_clear(cells, c, lattice):
-            for r in range(groups):
-                g = cell * groups + r
-                for k in range(4):
-                    capacity = lattice.volume * lattice.stiffness[g, k]
-                    if capacity.real > 0.0:
-                        x = value(cells, c, 0, pattern, r, k)
-                        y = value(cells, c, 1, pattern, r, k)
-                        for n in range(len(layers)):
-                            d, nx, ny, _ = distance(x, y, lattice.ground, n)
-                            if d.real < layers[n, THICKNESS]:
-                                b = bearing(
-                                    d, layers[n, THICKNESS], layers[n, STIFFNESS] * capacity
-                                )
-                                for order in range(COEFFICIENTS):
-                                    w = pattern[PATTERN_SIZE * r + VALUE + order, k]
-                                    moments[c + order, 0] += w * b * nx
-                                    moments[c + order, 1] += w * b * ny
-                                    moments[c + order, 2] += w * b
+    for group in range(len(near)):
+        if near[group]:
+            j, g = group // lattice.groups, group % lattice.groups
+            first = j * width + 4 * g
+            for b in range(n):
+                for a in range(n):
+                    r = ((j * n + b) * n + a) * lattice.groups + g
+                    x = value(state, first, a, b, lattice)
+                    y = value(state, M + first, a, b, lattice)
+                    for k in range(4):
+                        capacity = lattice.volume * lattice.stiffness[r, k]
+                        if capacity.real > 0.0:
+                            for m in range(len(layers)):
+                                d, nx, ny, _ = distance(x[k], y[k], lattice.ground, m)
+                                thickness = layers[m, THICKNESS]
+                                if d.real < thickness:
+                                    size = bearing(d, thickness, layers[m, STIFFNESS] * capacity)
+                                    at = first + k
+                                    value_adjoint(force[0], at, a, b, lattice, size * nx)
+                                    value_adjoint(force[1], at, a, b, lattice, size * ny)
+                                    value_adjoint(force[2], at, a, b, lattice, size)
 
 
-@jit
-def press_adjoint(cells, cells_bar, moments, lattice, bar):
-    """From polynomials of the adjoint of `press`: adds to moments of x_bar and stiffness_bar."""
-    groups, pattern = lattice.pattern.shape[0] // PATTERN_SIZE, lattice.pattern
+@bare_jit
+def press_adjoint(state, force_bar, lattice, near, state_bar, bar):
+    """From the nodes' f_bar and f_N_bar: adds to x_bar and to stiffness_bar."""
+    n, M, width = len(lattice.weights), len(lattice.mass), width_of(lattice)
     layers = lattice.ground.layers
-    for cell in range(lattice.columns * lattice.rows):
-        c = COEFFICIENTS * cell
-        if lattice.filled[cell] and not is_clear(cells, c, lattice):
-            for r in range(groups):
-                g = cell * groups + r
-                for k in range(4):
-                    capacity = lattice.volume * lattice.stiffness[g, k]
-                    if capacity.real > 0.0:
-                        x = value(cells, c, 0, pattern, r, k)
-                        y = value(cells, c, 1, pattern, r, k)
-                        qx = value(cells_bar, c, 0, pattern, r, k)
-                        qy = value(cells_bar, c, 1, pattern, r, k)
-                        force_bar = value(cells_bar, c, 2, pattern, r, k)
-                        for n in range(len(layers)):
-                            d, nx, ny, bend = distance(x, y, lattice.ground, n)
-                            thickness = layers[n, THICKNESS]
-                            if d.real < thickness:
-                                full = layers[n, STIFFNESS] * capacity
-                                b = bearing(d, thickness, full)
-                                b_bar = force_bar + nx * qx + ny * qy
-                                d_bar, full_bar = bearing_adjoint(d, thickness, full, b_bar)
-                                x_bar, y_bar = distance_adjoint(nx, ny, bend, d_bar, b * qx, b * qy)
-                                bar.stiffness[g, k] += (
-                                    layers[n, STIFFNESS] * lattice.volume * full_bar
-                                )
-                                for order in range(COEFFICIENTS):
-                                    w = pattern[PATTERN_SIZE * r + VALUE + order, k]
-                                    moments[c + order, 0] += w * x_bar
-                                    moments[c + order, 1] += w * y_bar
+    for group in range(len(near)):
+        if near[group]:
+            j, g = group // lattice.groups, group % lattice.groups
+            first = j * width + 4 * g
+            for b in range(n):
+                for a in range(n):
+                    r = ((j * n + b) * n + a) * lattice.groups + g
+                    x = value(state, first, a, b, lattice)
+                    y = value(state, M + first, a, b, lattice)
+                    qx = value(force_bar, first, a, b, lattice)
+                    qy = value(force_bar, M + first, a, b, lattice)
+                    qN = value(force_bar, 2 * M + first, a, b, lattice)
+                    for k in range(4):
+                        capacity = lattice.volume * lattice.stiffness[r, k]
+                        if capacity.real > 0.0:
+                            for m in range(len(layers)):
+                                d, nx, ny, bend = distance(x[k], y[k], lattice.ground, m)
+                                thickness = layers[m, THICKNESS]
+                                if d.real < thickness:
+                                    full = layers[m, STIFFNESS] * capacity
+                                    size = bearing(d, thickness, full)
+                                    size_bar = qN[k] + nx * qx[k] + ny * qy[k]
+                                    d_bar, full_bar = bearing_adjoint(d, thickness, full, size_bar)
+                                    x_bar, y_bar = distance_adjoint(
+                                        nx, ny, bend, d_bar, size * qx[k], size * qy[k]
+                                    )
+                                    bar.stiffness[r, k] += (
+                                        layers[m, STIFFNESS] * lattice.volume * full_bar
+                                    )
+                                    at = first + k
+                                    value_adjoint(state_bar[0], at, a, b, lattice, x_bar)
+                                    value_adjoint(state_bar[1], at, a, b, lattice, y_bar)
 
 
-@jit
+@bare_jit
 def contact_of(x, y, ground):
     """What `resistance` takes, of the ground that a node is the deepest in, and 1/d at a corner."""
     nearest, least = 0, math.inf
@@ -387,67 +485,65 @@ def contact_of(x, y, ground):
     return (nx, ny, layer[FRICTION], layer[DAMPING], layer[CREEPING]), bend
 
 
-@jit
-def fold(records, lattice):
+@bare_jit
+def fold(fields, lattice):
     """Add to nodes beside the mirror plane what the mirrored half puts there; its own transpose.
 
-    The plane is halfway between the last two lines of nodes. Lanes are (x, y, f_N, 0).
+    The plane is halfway between the last two lines of nodes. Fields are (f_x, f_y, f_N), (3, M).
     """
-    lines, rows, axis = lattice.columns + 2, lattice.rows + 2, lattice.mirror_axis
-    for line in range(rows if axis == 0 else lines):
-        inner = (lines - 2) * rows + line if axis == 0 else line * rows + rows - 2
-        outer = inner + rows if axis == 0 else inner + 1
-        for lane in range(3):
-            sign = -1.0 if lane == axis else 1.0
-            folded = records[inner, lane] + sign * records[outer, lane]
-            records[inner, lane], records[outer, lane] = folded, sign * folded
-
-
-@loop_jit
-def advance_lattice(
-    states: NDArray, pushes: NDArray, first: int, last: int, lattice: Any, signal: NDArray
-) -> tuple[int, int]:
-    """Steps `first` to `last` of a lattice: slot n of `states` (., M, 4) to slot n + 1, round.
-
-    A node's record is (x_x, x_y, v_x, v_y). Slots of `pushes` (., M) get by how much the layers
-    change nodes' speeds. Returns the step reached and the node that is not a number, or -1.
-    """
-    nodes = len(lattice.mass)
-    window = (0, 0, lattice.columns + 2, lattice.rows + 2)
-    records = COEFFICIENTS * window[2] * window[3]
-    cells, moments = np.zeros((records, 4), states.dtype), np.zeros((records, 4), states.dtype)
-    force = np.zeros((nodes, 4), states.dtype)
-    dt = lattice.dt
-    for n in range(first, last):
-        old, new = states[n % len(states)], states[(n + 1) % len(states)]
-        taylor(old, window, window, cells)
-        clear(moments, window)
-        forces(cells, moments, lattice, signal[n])
-        if len(lattice.ground.layers):
-            press(cells, moments, lattice)
-        taylor_adjoint(moments, window, force)
-        if lattice.mirror_axis >= 0:
-            fold(force, lattice)
-        push = pushes[n % len(pushes)]
-        for i in range(nodes):
-            u = v = 0.0 * old[i, 2]
-            push[i] = 0.0
-            if lattice.mass[i].real > 0.0:
-                per_m = dt / lattice.mass[i]
-                u = old[i, 2] + per_m * force[i, 0] + dt * lattice.gravity_x
-                v = old[i, 3] + per_m * force[i, 1] + dt * lattice.gravity_y
-                if force[i, 2].real > 0.0:
-                    push[i] = per_m * force[i, 2]
-                    contact, _ = contact_of(old[i, 0], old[i, 1], lattice.ground)
-                    u, v = resistance(u, v, push[i], contact)
-            new[i, 2], new[i, 3] = u, v
-            new[i, 0], new[i, 1] = old[i, 0] + dt * u, old[i, 1] + dt * v
-            if not (math.isfinite(u.real) and math.isfinite(v.real)):
-                return n, i
-    return last, -1
+    width, axis = width_of(lattice), lattice.mirror_axis
+    for line in range(lattice.rows + 2 if axis == 0 else width):
+        inner = line * width + lattice.columns if axis == 0 else lattice.rows * width + line
+        outer = inner + 1 if axis == 0 else inner + width
+        for field in range(3):
+            sign = -1.0 if field == axis else 1.0
+            folded = fields[field, inner] + sign * fields[field, outer]
+            fields[field, inner], fields[field, outer] = folded, sign * folded
 
 
 @jit
+def steps_per_mass(lattice):
+    """dt / m of the nodes (M,), and zero where they have no mass."""
+    per_mass = np.zeros_like(lattice.mass)
+    for i in range(len(per_mass)):
+        if lattice.mass[i].real > 0.0:
+            per_mass[i] = lattice.dt / lattice.mass[i]
+    return per_mass
+
+
+@bare_jit
+def move(old, new, force, per_mass, lattice):
+    """From a state and the forces on its nodes to the next; their fastest speed then, squared.
+
+    The speed is infinite, or not a number, if one's velocity is.
+    """
+    M, dt = len(lattice.mass), lattice.dt
+    fastest = real(0.0 * four(old, 0))
+    sound = True
+    for i in range(0, M, 4):
+        per_m, m = four(per_mass, i), four(lattice.mass, i)
+        u = four(old, 2 * M + i) + per_m * (four(force, i) + lattice.gravity_x * m)
+        v = four(old, 3 * M + i) + per_m * (four(force, M + i) + lattice.gravity_y * m)
+        put_four(new, 2 * M + i, u)
+        put_four(new, 3 * M + i, v)
+        if total(real(four(force, 2 * M + i))) > 0.0:
+            for k in range(i, i + 4):
+                if force[2, k].real > 0.0:
+                    contact, _ = contact_of(old[0, k], old[1, k], lattice.ground)
+                    push = per_mass[k] * force[2, k]
+                    new[2, k], new[3, k] = resistance(new[2, k], new[3, k], push, contact)
+            u, v = four(new, 2 * M + i), four(new, 3 * M + i)
+        put_four(new, i, four(old, i) + dt * u)
+        put_four(new, M + i, four(old, M + i) + dt * v)
+        speed = real(u) * real(u) + real(v) * real(v)
+        sound = sound and within(speed, 0.0, math.inf)
+        fastest = greatest(speed, fastest)
+    if not sound:
+        return math.inf
+    return max(max(fastest[0], fastest[1]), max(fastest[2], fastest[3]))
+
+
+@bare_jit
 def before_resistance(u, v, push, contact):
     """The velocity that `resistance` made (u, v) of; along ground that sticks, none."""
     nx, ny, mu, alpha, creeping = contact
@@ -460,10 +556,108 @@ def before_resistance(u, v, push, contact):
     return nx * normal - ny * along, ny * normal + nx * along
 
 
+@bare_jit
+def move_adjoint(old, new, force, per_mass, lattice, state_bar, force_bar, bar):
+    """From the next state's adjoint to that of the state, but for what forces give, and to f_bar.
+
+    Of the forces only f_N is read; f_x and f_y get velocities before the resistance.
+    """
+    M, dt = len(lattice.mass), lattice.dt
+    for i in range(0, M, 4):
+        per_m = four(per_mass, i)
+        u_bar = four(state_bar, 2 * M + i) + dt * four(state_bar, i)
+        v_bar = four(state_bar, 3 * M + i) + dt * four(state_bar, M + i)
+        u, v = four(new, 2 * M + i), four(new, 3 * M + i)
+        if total(four(force, 2 * M + i)) > 0.0:
+            put_four(state_bar, 2 * M + i, u_bar)
+            put_four(state_bar, 3 * M + i, v_bar)
+            put_four(force, i, u)
+            put_four(force, M + i, v)
+            for k in range(i, i + 4):
+                if force[2, k] > 0.0:
+                    resist_adjoint(k, old, force, per_mass, lattice, state_bar, force_bar, bar)
+            u, v = four(force, i), four(force, M + i)
+            u_bar, v_bar = four(state_bar, 2 * M + i), four(state_bar, 3 * M + i)
+        put_four(state_bar, 2 * M + i, u_bar)
+        put_four(state_bar, 3 * M + i, v_bar)
+        put_four(force_bar, i, per_m * u_bar)
+        put_four(force_bar, M + i, per_m * v_bar)
+        # dt f / m, of what is not lost by friction that sticks: u_bar is zero there.
+        u = u - four(old, 2 * M + i) - dt * lattice.gravity_x
+        v = v - four(old, 3 * M + i) - dt * lattice.gravity_y
+        add_four(bar.mass, i, (-1.0 / dt) * per_m * (u * u_bar + v * v_bar))
+
+
+@bare_jit
+def resist_adjoint(k, old, force, per_mass, lattice, state_bar, force_bar, bar):
+    """The transpose of the resistance to node k, in place: velocity in `force`, its adjoint."""
+    contact, bend = contact_of(old[0, k], old[1, k], lattice.ground)
+    nx, ny = contact[0], contact[1]
+    push = per_mass[k] * force[2, k]
+    u, v, u_bar, v_bar = force[0, k], force[1, k], state_bar[2, k], state_bar[3, k]
+    free_u, free_v = before_resistance(u, v, push, contact)
+    normal, along = nx * u + ny * v, nx * v - ny * u
+    nx_bar, ny_bar = u_bar * normal + v_bar * along, v_bar * normal - u_bar * along
+    u_bar, v_bar, push_bar = resistance_adjoint(free_u, free_v, push, contact, u_bar, v_bar)
+    normal_bar, along_bar = nx * u_bar + ny * v_bar, nx * v_bar - ny * u_bar
+    nx_bar += normal_bar * free_u + along_bar * free_v
+    ny_bar += normal_bar * free_v - along_bar * free_u
+    x_bar, y_bar = distance_adjoint(nx, ny, bend, 0.0, nx_bar, ny_bar)
+    state_bar[0, k] += x_bar
+    state_bar[1, k] += y_bar
+    state_bar[2, k], state_bar[3, k] = u_bar, v_bar
+    force[0, k], force[1, k] = free_u, free_v
+    force_bar[2, k] = push_bar * per_mass[k]
+    bar.mass[k] -= push_bar * push * per_mass[k] / lattice.dt
+
+
+@loop_jit
+def advance_lattice(
+    states: NDArray, first: int, last: int, lattice: Any, signal: NDArray
+) -> tuple[int, int]:
+    """Steps `first` to `last` of a lattice: slot n of `states` (., 4, M) to slot n + 1, round.
+
+    Returns the step reached, and a node whose velocity is not a number then, or -1.
+    """
+    rows, force = make_rows(4, 2, lattice), np.zeros((3, len(lattice.mass)), states.dtype)
+    near, per_mass = np.zeros(len(lattice.filled), np.bool_), steps_per_mass(lattice)
+    return steps(states, first, last, lattice, signal, rows, force, near, per_mass)
+
+
+@bare_loop_jit
+def steps(states, first, last, lattice, signal, rows, force, near, per_mass):
+    """What `advance_lattice` does, in the room that it makes."""
+    moved = math.inf
+    for n in range(first, last):
+        old, new = states[n % len(states)], states[(n + 1) % len(states)]
+        force[:] = 0.0
+        forces(old, lattice, signal[n], rows, force)
+        if len(lattice.ground.layers):
+            if moved > SKIN * lattice.dx:
+                find_near(old, lattice, near)
+                moved = 0.0
+            press(old, lattice, near, force)
+        if lattice.mirror_axis >= 0:
+            fold(force, lattice)
+        speed = move(old, new, force, per_mass, lattice)
+        if not speed < math.inf:
+            return n, first_unsound(new)
+        moved += lattice.dt * math.sqrt(speed)
+    return last, -1
+
+
+@bare_jit
+def first_unsound(state):
+    """The first node whose speed is infinite or not a number."""
+    for i in range(state.shape[1]):
+        if not abs(state[2, i]) + abs(state[3, i]) < math.inf:
+            return i
+    return 0
+
+
 @loop_jit
 def advance_lattice_adjoint(
     states: NDArray,
-    pushes: NDArray,
     first: int,
     last: int,
     lattice: Any,
@@ -474,76 +668,58 @@ def advance_lattice_adjoint(
 ) -> None:
     """The adjoint of `advance_lattice`, from step `last` back to `first`.
 
-    `state_bar` (M, 4) is overwritten; `bar` and `signal_bar` (steps, K) are added to.
+    `state_bar` (4, M) is overwritten; `bar` and `signal_bar` (steps, K) are added to.
     """
-    nodes = len(lattice.mass)
-    window = (0, 0, lattice.columns + 2, lattice.rows + 2)
-    records = COEFFICIENTS * window[2] * window[3]
-    cells, cells_bar = np.zeros((records, 4), states.dtype), np.zeros((records, 4), states.dtype)
-    moments = np.zeros((records, 4), states.dtype)
-    force_bar, back = np.zeros((nodes, 4), states.dtype), np.zeros((nodes, 4), states.dtype)
-    dt = lattice.dt
+    rows, force = make_rows(6, 4, lattice), np.zeros((3, len(lattice.mass)), states.dtype)
+    force_bar = np.zeros_like(force)
+    near, per_mass = np.zeros(len(lattice.filled), np.bool_), steps_per_mass(lattice)
+    steps_adjoint(
+        states, first, last, lattice, signal, rows, force, near, per_mass,
+        state_bar, force_bar, bar, signal_bar,
+    )  # fmt: skip
+
+
+@bare_loop_jit
+def steps_adjoint(
+    states, first, last, lattice, signal, rows, force, near, per_mass,
+    state_bar, force_bar, bar, signal_bar,
+):  # fmt: skip
+    """What `advance_lattice_adjoint` does, in the room that it makes."""
+    moved = math.inf
     for n in range(last - 1, first - 1, -1):
         old, new = states[n], states[n + 1]
-        for i in range(nodes):
-            for lane in range(3):
-                force_bar[i, lane] = 0.0
-            m = lattice.mass[i]
-            if m > 0.0:
-                u_bar = state_bar[i, 2] + dt * state_bar[i, 0]
-                v_bar = state_bar[i, 3] + dt * state_bar[i, 1]
-                u, v, push = new[i, 2], new[i, 3], pushes[n, i]
-                if push > 0.0:
-                    contact, bend = contact_of(old[i, 0], old[i, 1], lattice.ground)
-                    nx, ny = contact[0], contact[1]
-                    free_u, free_v = before_resistance(u, v, push, contact)
-                    normal, along = nx * u + ny * v, nx * v - ny * u
-                    nx_bar, ny_bar = u_bar * normal + v_bar * along, v_bar * normal - u_bar * along
-                    u_bar, v_bar, push_bar = resistance_adjoint(
-                        free_u, free_v, push, contact, u_bar, v_bar
-                    )
-                    u, v = free_u, free_v
-                    normal_bar, along_bar = nx * u_bar + ny * v_bar, nx * v_bar - ny * u_bar
-                    nx_bar += normal_bar * u + along_bar * v
-                    ny_bar += normal_bar * v - along_bar * u
-                    x_bar, y_bar = distance_adjoint(nx, ny, bend, 0.0, nx_bar, ny_bar)
-                    state_bar[i, 0] += x_bar
-                    state_bar[i, 1] += y_bar
-                    force_bar[i, 2] = push_bar * dt / m
-                    bar.mass[i] -= push_bar * push / m
-                force_bar[i, 0], force_bar[i, 1] = dt / m * u_bar, dt / m * v_bar
-                # dt f / m, of what is not lost by friction that sticks: u_bar is zero there.
-                pushed_x = u - old[i, 2] - dt * lattice.gravity_x
-                pushed_y = v - old[i, 3] - dt * lattice.gravity_y
-                bar.mass[i] -= (pushed_x * u_bar + pushed_y * v_bar) / m
-                state_bar[i, 2], state_bar[i, 3] = u_bar, v_bar
-            else:
-                state_bar[i, 2] = state_bar[i, 3] = 0.0
+        if len(lattice.ground.layers):
+            if moved > SKIN * lattice.dx:
+                find_near(old, lattice, near)
+                moved = 0.0
+            force[:] = 0.0
+            force_bar[2] = 0.0
+            press(old, lattice, near, force)
+            if lattice.mirror_axis >= 0:
+                fold(force, lattice)
+            moved += lattice.dt * fastest_of(old)
+        move_adjoint(old, new, force, per_mass, lattice, state_bar, force_bar, bar)
         if lattice.mirror_axis >= 0:
             fold(force_bar, lattice)
-        taylor(old, window, window, cells)
-        taylor(force_bar, window, window, cells_bar)
-        clear(moments, window)
-        forces_adjoint(cells, cells_bar, moments, lattice, signal[n], bar, signal_bar[n])
+        forces_adjoint(old, force_bar, lattice, signal[n], rows, state_bar, bar, signal_bar[n])
         if len(lattice.ground.layers):
-            press_adjoint(cells, cells_bar, moments, lattice, bar)
-        taylor_adjoint(moments, window, back)
-        for i in range(nodes):
-            add(state_bar, i, load(back, i))
+            press_adjoint(old, force_bar, lattice, near, state_bar, bar)
 
 
-def pattern(per_cell: int, dx: float) -> NDArray[np.float64]:
-    """Constants (21 R, 4) of the n x n particles of a cell, by which its polynomial is weighed.
+@bare_jit
+def fastest_of(state):
+    """The speed of the fastest node."""
+    M = state.shape[1]
+    fastest = 0.0 * four(state, 0)
+    for i in range(0, M, 4):
+        u, v = four(state, 2 * M + i), four(state, 3 * M + i)
+        fastest = greatest(u * u + v * v, fastest)
+    return math.sqrt(max(max(fastest[0], fastest[1]), max(fastest[2], fastest[3])))
 
-    Particle a n + b is a-th along x and b-th along y; what fills the last group is at the middle.
-    """
-    t = (np.arange(per_cell) + 0.5) / per_cell - 0.5
-    x, y = (each.ravel() for each in np.meshgrid(t, t, indexing="ij"))
-    groups = -(-x.size // 4)
-    x, y = (np.concatenate([each, np.zeros(4 * groups - each.size)]) for each in (x, y))
-    one = np.ones_like(x)
-    along_x = one, x, y, x * y, y * y / 2, x * y * y / 2
-    along_y = one, y, x, x * y, x * x / 2, x * x * y / 2
-    powers = [(one, x, x * x / 2)[i] * (one, y, y * y / 2)[j] for i in range(3) for j in range(3)]
-    constants = np.concatenate([np.stack([*along_x, *along_y]) / dx, powers])
-    return constants.reshape(PATTERN_SIZE, groups, 4).swapaxes(0, 1).reshape(-1, 4).copy()
+
+def weights(per_cell: int, dx: float) -> NDArray[np.float64]:
+    """Weights (n, 6) of a cell's three nodes along an axis for n particles: values, then slopes."""
+    t = (np.arange(per_cell) + 0.5) / per_cell
+    values = 0.5 * (1.0 - t) ** 2, 0.75 - (t - 0.5) ** 2, 0.5 * t**2
+    slopes = (t - 1.0) / dx, (1.0 - 2.0 * t) / dx, t / dx
+    return np.stack([*values, *slopes], axis=1)

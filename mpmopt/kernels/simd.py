@@ -34,6 +34,16 @@ def store(array, k, record):
         array[2 * k : 2 * k + 2] = record
 
 
+def four(array, place):
+    """The record of four numbers from a place on, counted through an array without gaps."""
+    return array.reshape(-1)[place : place + 4].copy()
+
+
+def put_four(array, place, record):
+    """Write what `four` reads."""
+    array.reshape(-1)[place : place + 4] = record
+
+
 def number(array, k, lane):
     """One number of record k of an array (M, 4)."""
     return array[k, lane]
@@ -151,6 +161,12 @@ def add(array, k, record):
 
 
 @jit
+def add_four(array, place, record):
+    """Add to what `four` reads."""
+    put_four(array, place, four(array, place) + record)
+
+
+@jit
 def pair_of(array, a, b, lane):
     """The pair of one number each of records a and b of an array (M, 4)."""
     return pair(number(array, a, lane), number(array, b, lane))
@@ -262,6 +278,35 @@ def _load(typingctx, array, k):
         return builder.load(pointer, align=4)
 
     return kind(array, types.intp), generate
+
+
+def _place(context, builder, array_type, array, place, vector):
+    """To what `four` reads."""
+    array = context.make_array(array_type)(context, builder, array)
+    return builder.bitcast(builder.gep(array.data, [place]), vector.as_pointer())
+
+
+@intrinsic
+def _four(typingctx, array, place):
+    kind = Register(array.dtype, 4)
+
+    def generate(context, builder, signature, arguments):
+        pointer = _place(context, builder, array, *arguments, _vector(kind))
+        return builder.load(pointer, align=4)
+
+    return kind(array, types.intp), generate
+
+
+@intrinsic
+def _put_four(typingctx, array, place, record):
+    kind = Register(array.dtype, 4)
+
+    def generate(context, builder, signature, arguments):
+        pointer = _place(context, builder, array, *arguments[:2], _vector(kind))
+        builder.store(arguments[2], pointer, align=4)
+        return context.get_dummy_value()
+
+    return types.none(array, types.intp, kind), generate
 
 
 @intrinsic
@@ -584,6 +629,16 @@ def _overload_nothing(array):
 @overload(store)
 def _overload_store(array, k, record):
     return lambda array, k, record: _store(array, k, record)
+
+
+@overload(four)
+def _overload_four(array, place):
+    return lambda array, place: _four(array, place)
+
+
+@overload(put_four)
+def _overload_put_four(array, place, record):
+    return lambda array, place, record: _put_four(array, place, record)
 
 
 @overload(number)

@@ -14,8 +14,8 @@ from mpmopt.kernels.spline import (
     taylor_adjoint,
     whole_window,
 )
-from mpmopt.kernels.stress import inertia, inertia_adjoint, stress, stress_adjoint
-from mpmopt.kernels.transfer import blend, blend_adjoint, g2p, g2p_adjoint, p2g, p2g_adjoint
+from mpmopt.kernels.stress import stress, stress_adjoint
+from mpmopt.kernels.transfer import g2p, g2p_adjoint, p2g, p2g_adjoint
 
 # Groups of four particles that are handled together, while what is derived of them is at hand.
 TILE = 16
@@ -45,7 +45,6 @@ def advance(states, grids, windows, logs, first, last, data, parameters, signal,
     parts, ends = scratch.parts, scratch.ends
     tile = make_tile(TILE, states)
     node_cells, velocity_cells = make_cells(scratch)
-    fields = len(scratch.velocity)
     for n in range(first, last + 1):
         old = states[n % states.shape[0]]
         new = states[(n + 1) % states.shape[0]]
@@ -60,28 +59,22 @@ def advance(states, grids, windows, logs, first, last, data, parameters, signal,
             elif n < last:
                 windows[slot, k, 0], windows[slot, k, 1] = i0, j0
                 windows[slot, k, 2], windows[slot, k, 3] = ni, nj
-                if ni * nj > parts.shape[2]:
+                if ni * nj > parts.shape[1]:
                     ends[k, 0] = PART_TOO_SMALL
                 else:
                     part = (i0, j0, ni, nj)
-                    for field in range(fields):
-                        clear(node_cells[field], part)
+                    clear(node_cells, part)
                     for g0 in range(p0, p1, TILE):
                         g1 = min(g0 + TILE, p1)
                         if not deform(old, new, parameters, log_J, g0, g1):
                             ends[k, 0], ends[k, 1] = INVERTED, first_inverted(new, g0, g1)
                             break
                         locate(old, parameters, part, tile, g0, g1)
-                        for field in range(fields):
-                            if field == 0:
-                                stress(old, new, log_J, data, parameters, signal[n], tile, g0, g1)
-                            else:
-                                inertia(old, data, parameters, tile, g0, g1)
-                            p2g(old, data, tile, node_cells[field], g0, g1)
+                        stress(old, new, log_J, data, parameters, signal[n], tile, g0, g1)
+                        p2g(old, data, tile, node_cells, g0, g1)
                         if len(parameters.ground.layers) > 0:
-                            press(old, data, parameters, tile, node_cells[0], g0, g1)
-                    for field in range(fields):
-                        taylor_adjoint(node_cells[field], part, parts[k, field])
+                            press(old, data, parameters, tile, node_cells, g0, g1)
+                    taylor_adjoint(node_cells, part, parts[k])
         if not meet(barrier_state, threads):
             return n, ABANDONED, -1
         for k in range(blocks):
@@ -94,18 +87,16 @@ def advance(states, grids, windows, logs, first, last, data, parameters, signal,
         if thread == 0:
             for k in range(4):
                 windows[slot, blocks, k] = window[k]
-        if ni * nj > grid.shape[1]:
+        if ni * nj > grid.shape[0]:
             return n, WINDOW_TOO_SMALL, -1
         columns = range(thread * ni // threads, (thread + 1) * ni // threads)
-        for field in range(fields):
-            for a in columns:
-                add_blocks(parts, field, windows[slot], window, a, grid[field])
+        for a in columns:
+            add_blocks(parts, windows[slot], window, a, grid)
         if parameters.mirror_axis >= 0:
             if not meet(barrier_state, threads):
                 return n, ABANDONED, -1
             if thread == 0:
-                for field in range(fields):
-                    mirror(grid[field], window, parameters)
+                mirror(grid, window, parameters)
             if not meet(barrier_state, threads):
                 return n, ABANDONED, -1
         for a in columns:
@@ -115,14 +106,11 @@ def advance(states, grids, windows, logs, first, last, data, parameters, signal,
         for k in own:
             w = windows[slot, k]
             part = (w[0], w[1], w[2], w[3])
-            for field in range(fields):
-                taylor(scratch.velocity[field], window, part, velocity_cells[field])
+            taylor(scratch.velocity, window, part, velocity_cells)
             for g0 in range(data.first[k], data.first[k + 1], TILE):
                 g1 = min(g0 + TILE, data.first[k + 1])
                 locate(old, parameters, part, tile, g0, g1)
-                g2p(old, new, parameters, tile, velocity_cells[0], g0, g1)
-                if fields == 2:
-                    blend(old, new, parameters, tile, velocity_cells[1], g0, g1)
+                g2p(old, new, parameters, tile, velocity_cells, g0, g1)
     return last, DONE, -1
 
 
@@ -141,7 +129,6 @@ def advance_adjoint(states, grids, windows, logs, first, last, data, parameters,
     tile = make_tile(TILE, states)
     node_cells, velocity_cells = make_cells(scratch)
     _, velocity_cells_bar = make_cells(scratch)
-    fields = len(velocity)
     for n in range(last - 1, first - 1, -1):
         old, new, grid, log_J = states[n], states[n + 1], grids[n], logs[n]
         w = windows[n, blocks]
@@ -155,26 +142,17 @@ def advance_adjoint(states, grids, windows, logs, first, last, data, parameters,
             p0, p1 = data.first[k], data.first[k + 1]
             w = windows[n, k]
             part = (w[0], w[1], w[2], w[3])
-            for field in range(fields):
-                taylor(velocity[field], window, part, velocity_cells[field])
-                clear(velocity_cells_bar[field], part)
+            taylor(velocity, window, part, velocity_cells)
+            clear(velocity_cells_bar, part)
             for g0 in range(p0, p1, TILE):
                 g1 = min(g0 + TILE, p1)
                 locate(old, parameters, part, tile, g0, g1)
-                g2p_adjoint(
-                    parameters, tile, velocity_cells[0], velocity_cells_bar[0], bar, g0, g1
-                )  # fmt: skip
-                if fields == 2:
-                    blend_adjoint(
-                        parameters, tile, velocity_cells[1], velocity_cells_bar[1], bar, g0, g1
-                    )  # fmt: skip
-            for field in range(fields):
-                taylor_adjoint(velocity_cells_bar[field], part, parts_bar[k, field])
+                g2p_adjoint(parameters, tile, velocity_cells, velocity_cells_bar, bar, g0, g1)
+            taylor_adjoint(velocity_cells_bar, part, parts_bar[k])
         if not meet(barrier_state, threads):
             return
         for a in columns:
-            for field in range(fields):
-                add_blocks(parts_bar, field, windows[n], window, a, velocity_bar[field])
+            add_blocks(parts_bar, windows[n], window, a, velocity_bar)
             grid_update_adjoint(
                 grid, window, parameters, parameters.clamps[n], velocity_bar, scratch.node_bar, a
             )
@@ -182,34 +160,23 @@ def advance_adjoint(states, grids, windows, logs, first, last, data, parameters,
             return
         if parameters.mirror_axis >= 0:
             if thread == 0:
-                for field in range(fields):
-                    mirror(scratch.node_bar[field], window, parameters)
+                mirror(scratch.node_bar, window, parameters)
             if not meet(barrier_state, threads):
                 return
         for k in own:
             p0, p1 = data.first[k], data.first[k + 1]
             w = windows[n, k]
             part = (w[0], w[1], w[2], w[3])
-            for field in range(fields):
-                taylor(scratch.node_bar[field], window, part, node_cells[field])
+            taylor(scratch.node_bar, window, part, node_cells)
             for g0 in range(p0, p1, TILE):
                 g1 = min(g0 + TILE, p1)
                 locate(old, parameters, part, tile, g0, g1)
-                for field in range(fields):
-                    if field == 0:
-                        stress(old, new, log_J, data, parameters, signal[n], tile, g0, g1)
-                    else:
-                        inertia(old, data, parameters, tile, g0, g1)
-                    p2g_adjoint(
-                        old, data, parameters, tile, node_cells[field], bar, data_bar, g0, g1
-                    )
-                    if field == 0:
-                        stress_adjoint(
-                            old, new, log_J, data, parameters, signal[n], tile, bar, data_bar,
-                            signal_bar[k, n], g0, g1,
-                        )  # fmt: skip
-                    else:
-                        inertia_adjoint(old, data, tile, bar, data_bar, g0, g1)
+                stress(old, new, log_J, data, parameters, signal[n], tile, g0, g1)
+                p2g_adjoint(old, data, parameters, tile, node_cells, bar, data_bar, g0, g1)
+                stress_adjoint(
+                    old, new, log_J, data, parameters, signal[n], tile, bar, data_bar,
+                    signal_bar[k, n], g0, g1,
+                )  # fmt: skip
                 if len(parameters.ground.layers) > 0:
-                    press_adjoint(old, data, parameters, tile, node_cells[0], bar, data_bar, g0, g1)
+                    press_adjoint(old, data, parameters, tile, node_cells, bar, data_bar, g0, g1)
                 deform_adjoint(old, parameters, bar, g0, g1)

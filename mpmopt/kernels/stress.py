@@ -76,26 +76,3 @@ def stress_adjoint(
             h00, h01, h10, h11 = actuation_adjoint(F, data, g, signal, T, signal_bar)
             b00, b01, b10, b11 = b00 + h00, b01 + h01, b10 + h10, b11 + h11
         store_tensor(bar, at(g, DEFORMATION), b00, b01, b10, b11)
-
-
-@jit
-def inertia(old, data, parameters, tile, first, last):
-    """Affine momentum A dx of the velocity alone, m C dx, in the place of `stress`."""
-    for g in range(first, last):
-        m = parameters.dx * load(data.mass, g)
-        c00, c01, c10, c11 = tensor(old, at(g, AFFINE))
-        store_tensor(tile.affine, 4 * (g - first), m * c00, m * c01, m * c10, m * c11)
-
-
-@jit
-def inertia_adjoint(old, data, tile, bar, data_bar, first, last):
-    """Adds to C_bar and to the adjoint of the mass."""
-    for g in range(first, last):
-        c00, c01, c10, c11 = tensor(old, at(g, AFFINE))
-        a00, a01, a10, a11 = tensor(tile.gathered, in_tile(g - first, AFFINE_BAR))
-        m = load(data.mass, g)
-        add(data_bar.mass, g, a00 * c00 + a01 * c01 + a10 * c10 + a11 * c11)
-        add(bar, at(g, AFFINE), m * a00)
-        add(bar, at(g, AFFINE + 1), m * a01)
-        add(bar, at(g, AFFINE + 2), m * a10)
-        add(bar, at(g, AFFINE + 3), m * a11)

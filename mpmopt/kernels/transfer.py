@@ -19,7 +19,6 @@ from mpmopt.kernels.simd import (
     nothing,
     number,
     pack,
-    pair,
     pair_of,
     set_number,
     store,
@@ -108,7 +107,7 @@ def g2p(old, new, parameters, tile, cells, first, last):
 def g2p_adjoint(parameters, tile, cells, cells_bar, bar, first, last):
     """From x_bar', v_bar', C_bar' to velocity_bar, as moments of cells, and to x_bar, v_bar, C_bar.
 
-    Without a blend v_bar and C_bar are zero here: what follows adds to them.
+    v_bar and C_bar are zero here: what follows adds to them.
     """
     dt, per_dx = parameters.dt, parameters.per_dx
     c, h = 4.0 * per_dx, tile.gathered
@@ -118,7 +117,7 @@ def g2p_adjoint(parameters, tile, cells, cells_bar, bar, first, last):
         for axis in range(2):
             x_bar, v_bar = load(bar, at(g, POSITION + axis)), load(bar, at(g, VELOCITY + axis))
             store(h, in_tile(t, VELOCITY_BAR + axis), v_bar + dt * x_bar)
-            store(bar, at(g, VELOCITY + axis), parameters.keep * v_bar)
+            store(bar, at(g, VELOCITY + axis), none)
         c00, c01, c10, c11 = tensor(bar, at(g, AFFINE))
         store_tensor(h, in_tile(t, AFFINE_BAR), c * c00, c * c01, c * c10, c * c11)
         store_tensor(bar, at(g, AFFINE), none, none, none, none)
@@ -128,38 +127,5 @@ def g2p_adjoint(parameters, tile, cells, cells_bar, bar, first, last):
             c1 = pair_of(h, in_tile(t, AFFINE_BAR + 1), in_tile(t, AFFINE_BAR + 3), k)
             slope_x, slope_y = slopes(cells, tile, t, k, v_bar, c0, c1)
             deposit(cells_bar, tile, t, k, v_bar, c0, c1)
-            add_number(bar, at(g, POSITION), k, per_dx * total(slope_x))
-            add_number(bar, at(g, POSITION + 1), k, per_dx * total(slope_y))
-
-
-@jit
-def blend(old, new, parameters, tile, cells, first, last):
-    """Particles keep a share of what the transfer of their own velocity smoothed away."""
-    for g in range(first, last):
-        t = g - first
-        for k in range(4):
-            mean, _, _ = moments(cells, tile, t, k)
-            set_number(tile.gathered, in_tile(t, VELOCITY_BAR), k, mean[0])
-            set_number(tile.gathered, in_tile(t, VELOCITY_BAR + 1), k, mean[1])
-        for axis in range(2):
-            smoothed = load(tile.gathered, in_tile(t, VELOCITY_BAR + axis))
-            lost = load(old, at(g, VELOCITY + axis)) - smoothed
-            add(new, at(g, VELOCITY + axis), parameters.keep * lost)
-
-
-@jit
-def blend_adjoint(parameters, tile, cells, cells_bar, bar, first, last):
-    """To velocity_bar of the second field, as moments of cells; adds to x_bar.
-
-    After `g2p_adjoint`, which leaves keep v_bar' as v_bar.
-    """
-    per_dx = parameters.per_dx
-    for g in range(first, last):
-        t = g - first
-        for k in range(4):
-            v_bar = pair(-number(bar, at(g, VELOCITY), k), -number(bar, at(g, VELOCITY + 1), k))
-            none = nothing(cells)
-            slope_x, slope_y = slopes(cells, tile, t, k, v_bar, none, none)
-            deposit(cells_bar, tile, t, k, v_bar, none, none)
             add_number(bar, at(g, POSITION), k, per_dx * total(slope_x))
             add_number(bar, at(g, POSITION + 1), k, per_dx * total(slope_y))

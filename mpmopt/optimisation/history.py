@@ -56,6 +56,8 @@ class Iteration:
         all (`task.FEASIBLE`), or not a number if it failed.
     constraints : tuple of float
         Values of the constraints' terms, in the task's order.
+    scenes : tuple of float
+        L in each scene of the task; empty if it has one.
     multipliers : tuple of float
         By how much L rises with each bound, as the step that led here took it; zeros for the first.
     failure : str
@@ -82,6 +84,7 @@ class Iteration:
     gap: float = np.nan
     violation: float = 0.0
     constraints: tuple[float, ...] = ()
+    scenes: tuple[float, ...] = ()
     multipliers: tuple[float, ...] = ()
     failure: str = ""
 

@@ -335,6 +335,7 @@ class _Ascent:
         """Value and gradient, recorded, even of a simulation that failed."""
         run = self.run
         value, failure, violation = np.nan, "", np.nan
+        scenes = len(run.task.scenes) * (np.nan,)
         constraints = np.full(len(run.task.subject_to), np.nan)
         gradients: NDArray[np.float64] = np.full((1, x.size), np.nan)
         problem, halved = self.problem, self.problem.halvings
@@ -343,6 +344,7 @@ class _Ascent:
         try:
             evaluation = problem.evaluate(x)
             value, constraints = evaluation.value, evaluation.constraints
+            scenes = evaluation.scenes
             gradients = evaluation.gradients
             violation = run.task.violation(constraints)
             halved, indicators = evaluation.halved, evaluation.indicators
@@ -387,6 +389,7 @@ class _Ascent:
             gap=indicators.gap,
             violation=violation,
             constraints=tuple(constraints.tolist()),
+            scenes=scenes,
             multipliers=self.multipliers,
             failure=failure,
         )

@@ -1,6 +1,6 @@
 """The one file that a run leaves: scene, settings, versions, history and designs, in HDF5.
 
-Layout (version 5)::
+Layout (version 6)::
 
     attributes       format, version, stage, reason, gave_up, stop_reason; as JSON: scene,
                      settings, task, versions, summary
@@ -41,9 +41,9 @@ from mpmopt.optimisation.settings import Settings
 from mpmopt.scene import Scene
 from mpmopt.validation import instance, place
 
-FORMAT, VERSION = "mpmopt run", 5
+FORMAT, VERSION = "mpmopt run", 6
 WHOLE = tuple(f.name for f in dataclasses.fields(Iteration) if f.type == "int")
-# For each constraint one.
+# For each constraint or scene one.
 TUPLES = tuple(f.name for f in dataclasses.fields(Iteration) if f.type == "tuple[float, ...]")
 COLUMNS = tuple(f.name for f in dataclasses.fields(Iteration) if f.type in ("int", "float"))
 
@@ -128,7 +128,7 @@ def _fill(file: h5py.File, run: Optimisation) -> None:
         file.create_dataset(f"history/{name}", data=column, dtype="f8")
     for name in TUPLES:
         rows = np.array([getattr(item, name) for item in run.history], dtype=float)
-        shape = (len(run.history), len(run.task.subject_to))
+        shape = (len(run.history), _width(name, run.task))
         file.create_dataset(f"history/{name}", data=rows.reshape(shape), dtype="f8")
     file.create_dataset(
         "history/failure", data=[i.failure for i in run.history], dtype=h5py.string_dtype()
@@ -218,7 +218,7 @@ def _read(file: h5py.File, path: Path) -> RunFile:
         reason=str(file.attrs["reason"]),
         gave_up=bool(file.attrs["gave_up"]),
         best=_read_best(file.get("stages", {}), len(settings.stages)),
-        history=_read_history(file["history"], len(task.subject_to)),
+        history=_read_history(file["history"], task),
         first=_read_candidate(file, "first"),
         last=_read_candidate(file, "last"),
         stage_state=_read_stage(file["stage"]) if "stage" in file else None,
@@ -234,13 +234,18 @@ def _read(file: h5py.File, path: Path) -> RunFile:
     )
 
 
-def _read_history(group: h5py.Group, constraints: int) -> list[Iteration]:
+def _width(name: str, task: Task) -> int:
+    """How many numbers an evaluation has of those in `TUPLES`."""
+    return len(task.scenes if name == "scenes" else task.subject_to)
+
+
+def _read_history(group: h5py.Group, task: Task) -> list[Iteration]:
     columns: dict[str, Any] = {name: _numbers(group, name).tolist() for name in COLUMNS}
     columns["failure"] = group["failure"].asstr()[:].tolist()
     for name in TUPLES:
         rows = _numbers(group, name, 2)
-        if rows.shape[1] != constraints:
-            raise ValueError(f"{name} of {rows.shape[1]} constraints, the task has {constraints}")
+        if rows.shape[1] != _width(name, task):
+            raise ValueError(f"{name}: {rows.shape[1]} columns, its task has {_width(name, task)}")
         columns[name] = list(map(tuple, rows.tolist()))
     for name in WHOLE:
         columns[name] = [int(value) for value in columns[name]]

@@ -198,7 +198,6 @@ def check_formulation(scene: Scene) -> None:
     for what, there, cure in (
         (f"{len(scene.walls)} walls", scene.walls, "stand the body on a Ground"),
         (f"{len(scene.clamps)} clamps", scene.clamps, "hold the body otherwise"),
-        (f"blend_time = {scene.blend_time:g}", scene.blend_time, "give the material a viscosity"),
     ):
         if there:
             raise SceneError(

@@ -81,10 +81,6 @@ class Scene(Checked):
         "updated" is MLS-MPM, the paper's: a grid is laid anew at every step, and solid may tear.
         "total" is total Lagrangian: the body keeps the lattice of its reference configuration, at a
         fraction of the cost, and stands on `ground`. Its parts do not feel each other.
-    blend_time : float, optional
-        Time tau in which particles lose what the transfer to the grid and back smooths away: they
-        keep a share exp(-time_step / tau) of it in every step, so that damping is a rate and not
-        a matter of the step. Zero is the affine transfer, as in the paper: they keep nothing.
     transient : float, optional
         Time at the start in which travel does not count, so that a body which tips over once gains
         nothing by it, rounded to whole steps. Zero, as in the paper: all of it counts.
@@ -107,7 +103,6 @@ class Scene(Checked):
     filter_weights: tuple[float, float, float] = (0.64, 0.08, 0.01)
     filter_length: float = 0.0
     mirror: Mirror | None = None
-    blend_time: float = 0.0
     formulation: Formulation = "updated"
     transient: float = 0.0
     ground: tuple[Ground, ...] = ()
@@ -142,7 +137,6 @@ class Scene(Checked):
                 "Scene", "particles_per_cell", self.particles_per_cell, 1, MOST_PER_CELL
             ),
             filter_length=number("Scene", "filter_length", self.filter_length),
-            blend_time=number("Scene", "blend_time", self.blend_time),
             transient=number("Scene", "transient", self.transient),
             filter_weights=entries(
                 "Scene",
@@ -163,7 +157,7 @@ class Scene(Checked):
                 f"Scene: filter_weights sum to w0 + 4 w1 + 4 w2 = {w0 + 4 * w1 + 4 * w2:.15g}, "
                 "must sum to 1"
             )
-        for name in ("filter_length", "blend_time", "transient"):
+        for name in ("filter_length", "transient"):
             if getattr(self, name) < 0.0:
                 raise SceneError(f"Scene: {name} = {getattr(self, name):g} must not be negative")
         if self.filter_passes > MOST_PASSES:

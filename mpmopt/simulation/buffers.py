@@ -56,17 +56,16 @@ class Segment:
         self.blocks = len(simulation.data.first) - 1
         self.windows = np.zeros((length, self.blocks + 1, 4), np.int64)
         self.logs = memory.take("logs", (length, groups, 4), dtype)
-        self.grids = np.empty((length, simulation.fields, 0, kernels.NODE_SIZE), dtype)
+        self.grids = np.empty((length, 0, kernels.NODE_SIZE), dtype)
         self.recomputed: set[int] = set()  # segments whose windows outgrew their room in the store
-        kept = length * simulation.fields * simulation.room[0] * kernels.NODE_SIZE
+        kept = length * simulation.room[0] * kernels.NODE_SIZE
         self.most = max(MOST_NUMBERS, 4 * kept)
         self.reserve(*simulation.room, 0)
 
     def reserve(self, nodes: int, part: int, step: int) -> None:
         """`resize`, unless that would take far more memory than the run began with."""
-        length, fields, _, _ = self.grids.shape
-        kept = length * fields * nodes * kernels.NODE_SIZE
-        shared = max(self.blocks, 2 * 9) * fields * part * kernels.NODE_SIZE
+        kept = len(self.grids) * nodes * kernels.NODE_SIZE
+        shared = max(self.blocks, 2 * 9) * part * kernels.NODE_SIZE
         for numbers, most in ((kept, self.most), (shared, MOST_NUMBERS)):
             if numbers > most:
                 raise SimulationError(
@@ -82,14 +81,14 @@ class Segment:
 
     def resize(self, nodes: int, part: int) -> None:
         """Make room for windows of so many nodes, and so many in a block's, keeping the grids."""
-        kept, fields = self.grids, self.simulation.fields
-        shape = (len(kept), fields, nodes, kernels.NODE_SIZE)
+        kept = self.grids
+        shape = (len(kept), nodes, kernels.NODE_SIZE)
         if kept.size == 0:
             self.grids = self.memory.take("grids", shape, kept.dtype)
         else:
             self.grids = np.empty(shape, kept.dtype)
-            self.grids[:, :, : kept.shape[2]] = kept
-        self.scratch = kernels.Scratch.make(fields, nodes, self.blocks, part, kept.dtype)
+            self.grids[:, : kept.shape[1]] = kept
+        self.scratch = kernels.Scratch.make(nodes, self.blocks, part, kept.dtype)
 
     def advance(self, first: int, last: int) -> None:
         """Advance from step `first`, whose state is in slot 0, to step `last`."""
@@ -113,7 +112,7 @@ class Segment:
                 signal,
                 self.scratch,
             )
-            nodes, part = self.grids.shape[2], self.scratch.parts.shape[2]
+            nodes, part = self.grids.shape[1], self.scratch.parts.shape[1]
             window = self.windows[reached % len(self.windows), :, 2:].prod(axis=1)
             if end == kernels.WINDOW_TOO_SMALL:
                 self.reserve(int(1.25 * window[-1]), part, first + reached)
@@ -132,7 +131,7 @@ class Segment:
             self.recomputed.add(index)
             checkpoints.write(index, states=self.states)
         else:
-            grids = self.grids[:, :, :used]
+            grids = self.grids[:, :used]
             checkpoints.write(
                 index, states=self.states, grids=grids, windows=self.windows, logs=self.logs
             )
@@ -150,7 +149,7 @@ class Segment:
             self.windows[:] = checkpoints.read(index, "windows")
             self.logs[:] = checkpoints.read(index, "logs")
             grids = checkpoints.read(index, "grids")
-            self.grids[:, :, : grids.shape[2]] = grids
+            self.grids[:, : grids.shape[1]] = grids
 
 
 def _failure(

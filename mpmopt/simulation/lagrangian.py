@@ -13,6 +13,7 @@ from numpy.typing import DTypeLike, NDArray
 from mpmopt import kernels
 from mpmopt.errors import DesignError, SimulationError
 from mpmopt.kernels import lagrangian
+from mpmopt.scene.parts import Vector
 from mpmopt.simulation.buffers import Memory
 from mpmopt.simulation.checkpoints import Checkpointing, Checkpoints, Schedule
 from mpmopt.simulation.energy import LOOK
@@ -24,7 +25,7 @@ class LagrangianSimulation(Simulation):
     """One body on its own lattice: for bodies that do not tear, at a fraction of the cost.
 
     It takes what `Simulation` takes, begins at rest and undeformed, and gives particle states of
-    the same layout, whose affine velocity is zero. Its own state are nodes (M, 4): position and
+    the same layout, whose affine velocity is zero. Its own state are nodes (4, M): position and
     velocity.
     """
 
@@ -40,30 +41,31 @@ class LagrangianSimulation(Simulation):
         per_cell, dx = scene.particles_per_cell, scene.grid.dx
         count, dtype = len(particles.position), self.initial.dtype
         low, high = self._cells()
-        columns, rows = high - low
+        columns, rows = (int(cells) for cells in high - low)
+        groups = -(-columns // 4)
+        width = 4 * (groups + 1)
         site = np.floor(particles.position * (per_cell / dx)).astype(np.int64) - low * per_cell
         cell, place = site // per_cell, site % per_cell
-        groups = -(-(per_cell**2) // 4)
-        self._slot = (
-            4 * groups * (cell[:, 0] * rows + cell[:, 1]) + place[:, 0] * per_cell + place[:, 1]
-        )
-        shape = (columns * rows * groups, 4)
+        line = (cell[:, 1] * per_cell + place[:, 1]) * per_cell + place[:, 0]
+        self._slot = 4 * groups * line + cell[:, 0]
+        records = rows * per_cell**2 * groups
 
         def laid_out(values: NDArray) -> NDArray:
-            """Numbers (N,) of particles as records of the lattice, zero where none is."""
-            records = np.zeros(shape[0] * 4, values.dtype)
-            records[self._slot] = values
-            return records.reshape(shape)
+            """Numbers (N,) of particles as records (V, 4) of the lattice, zero where none is."""
+            numbers = np.zeros(4 * records, values.dtype)
+            numbers[self._slot] = values
+            return numbers.reshape(records, 4)
 
         def of_particles(records: NDArray) -> NDArray:
             return kernels.ungrouped(records, 1, count)[0]
 
-        self.nodes = (columns + 2) * (rows + 2)
-        self._weights = self._interpolation(cell, place, int(rows))
+        self.nodes = (rows + 2) * width
+        self._weights = self._interpolation(cell, place, width)
         there = laid_out(np.ones(count))
         actuated = np.array([laid_out(of_particles(each)) for each in self.data.actuated])
-        actuated = actuated.reshape(-1, *shape)
-        constants = [laid_out(of_particles(each)) for each in self.data.constants]
+        actuated = actuated.reshape(-1, records, 4)
+        constants = np.array([of_particles(each) for each in self.data.constants])
+        alike = bool(np.all(constants == constants[:, :1]))
         mass = self._weights[0].T @ of_particles(self.data.mass)
         axis = self._mirror_axis(high)
         self.lattice = lagrangian.Lattice(
@@ -71,26 +73,30 @@ class LagrangianSimulation(Simulation):
             dx=dx,
             gravity_x=scene.gravity[0],
             gravity_y=scene.gravity[1],
-            columns=int(columns),
-            rows=int(rows),
+            columns=columns,
+            groups=groups,
+            rows=rows,
             volume=(dx / per_cell) ** 2,
-            viscous=bool(np.any(self.data.constants[2] > 0.0)),
+            viscous=bool(np.any(constants[2] > 0.0)),
             mirror_axis=axis,
-            pattern=lagrangian.pattern(per_cell, dx),
-            constants=np.array(constants),
+            weights=lagrangian.weights(per_cell, dx),
+            constants=np.repeat(constants[:, :1], 4, axis=1)[:, None]
+            if alike
+            else np.array([laid_out(each) for each in constants]),
+            varied=int(not alike),
             stiffness=laid_out(of_particles(self.data.stiffness)),
-            filled=np.any(there.reshape(columns * rows, -1), axis=1),
+            filled=np.any(there.reshape(rows, -1, groups, 4), axis=(1, 3)).ravel(),
             actuated=actuated,
             active=np.any(actuated, axis=(0, 2)),
             actuation_stress=self.data.actuation_stress,
-            mass=self._folded(mass, axis, int(rows)),
+            mass=self._folded(mass, axis, columns, width),
             ground=self.parameters.ground,
             nodes_y=self.parameters.nodes_y,
             nodes_x=self.parameters.nodes_x,
         )
-        at = np.stack(np.meshgrid(np.arange(columns + 2), np.arange(rows + 2), indexing="ij"))
-        self.start = np.zeros((self.nodes, 4), dtype)
-        self.start[:, :2] = ((at.reshape(2, -1).T - 0.5) + low) * dx
+        at = np.stack(np.meshgrid(np.arange(width), np.arange(rows + 2), indexing="xy"))
+        self.start = np.zeros((4, self.nodes), dtype)
+        self.start[:2] = (at.reshape(2, -1) - 0.5 + low[:, None]) * dx
 
     def _cells(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """First cell of the body along both axes, and the one after its last."""
@@ -110,17 +116,17 @@ class LagrangianSimulation(Simulation):
             return -1
         return mirror.normal
 
-    def _folded(self, mass: NDArray, axis: int, rows: int) -> NDArray:
+    def _folded(self, mass: NDArray, axis: int, columns: int, width: int) -> NDArray:
         """Masses of nodes, of which those beside a mirror plane also have their image's."""
         if axis < 0:
             return mass
-        lines = mass.reshape(-1, rows + 2).copy()
-        beside = lines[-2:] if axis == 0 else lines[:, -2:].T
+        lines = mass.reshape(-1, width).copy()
+        beside = lines[:, columns : columns + 2].T if axis == 0 else lines[-2:]
         beside[:] = beside.sum(axis=0)
         return lines.ravel()
 
     def _interpolation(
-        self, cell: NDArray[np.int64], place: NDArray[np.int64], rows: int
+        self, cell: NDArray[np.int64], place: NDArray[np.int64], width: int
     ) -> tuple[scipy.sparse.csr_array, ...]:
         """Value and derivatives along x and y at the particles, (N, M) each."""
         dx, per_cell = self.scene.grid.dx, self.scene.particles_per_cell
@@ -128,7 +134,7 @@ class LagrangianSimulation(Simulation):
         value = np.stack([0.5 * (1.0 - t) ** 2, 0.75 - (t - 0.5) ** 2, 0.5 * t**2])  # (3, N, 2)
         slope = np.stack([t - 1.0, 1.0 - 2.0 * t, t]) / dx
         count = len(cell)
-        node = [(cell[:, 0] + a) * (rows + 2) + cell[:, 1] + b for a in range(3) for b in range(3)]
+        node = [(cell[:, 1] + b) * width + cell[:, 0] + a for a in range(3) for b in range(3)]
         where = (np.tile(np.arange(count), 9), np.concatenate(node))
 
         def matrix(along_x: NDArray, along_y: NDArray) -> scipy.sparse.csr_array:
@@ -138,34 +144,34 @@ class LagrangianSimulation(Simulation):
         return matrix(value, value), matrix(slope, value), matrix(value, slope)
 
     def particle_state(self, nodes: NDArray) -> NDArray:
-        """The state (12, N) of the particles from that (M, 4) of the nodes."""
+        """The state (12, N) of the particles from that (4, M) of the nodes."""
         N, Gx, Gy = self._weights
         state = np.zeros(self.initial.shape, nodes.dtype)
         x, v, _, F = kernels.parts(state)
-        x[:], v[:] = (N @ nodes[:, :2]).T, (N @ nodes[:, 2:]).T
-        F[:, 0], F[:, 1] = (Gx @ nodes[:, :2]).T, (Gy @ nodes[:, :2]).T
+        x[:], v[:] = (N @ nodes[:2].T).T, (N @ nodes[2:].T).T
+        F[:, 0], F[:, 1] = (Gx @ nodes[:2].T).T, (Gy @ nodes[:2].T).T
         return state
 
     def particle_state_adjoint(self, bar: NDArray) -> NDArray:
-        """Adjoint (M, 4) of the nodes' state from that of the particles' (12, N)."""
+        """Adjoint (4, M) of the nodes' state from that of the particles' (12, N)."""
         N, Gx, Gy = self._weights
         x_bar, v_bar, C_bar, F_bar = kernels.parts(bar)
         if np.any(C_bar):
             raise DesignError("the total Lagrangian formulation has no affine velocity to ask for")
         position = N.T @ x_bar.T + Gx.T @ F_bar[:, 0].T + Gy.T @ F_bar[:, 1].T
-        return np.concatenate([position, N.T @ v_bar.T], axis=1)
+        return np.concatenate([position, N.T @ v_bar.T], axis=1).T.copy()
 
-    def _advance(self, states: NDArray, pushes: NDArray, first: int, last: int, begin: int) -> None:
+    def _advance(self, states: NDArray, first: int, last: int, begin: int) -> None:
         """Steps `first` to `last`; slots and signals are counted from step `begin`."""
         signal = self.signal[begin:]
         step = first
         while step < last:
             stop = min(last, step + self.steps_per_call)
             reached, node = lagrangian.advance_lattice(
-                states, pushes, step - begin, stop - begin, self.lattice, signal
+                states, step - begin, stop - begin, self.lattice, signal
             )
             if node >= 0:
-                x, y = (float(c) for c in np.real(states[reached % len(states), node, :2]))
+                x, y = (float(c) for c in np.real(states[reached % len(states), :2, node]))
                 raise SimulationError(
                     "a node is not a number", begin + reached, -1, (x, y),
                     f"take a smaller time step (now {self.scene.time_step:g}), a higher void "
@@ -175,31 +181,40 @@ class LagrangianSimulation(Simulation):
 
     def run(self, frames: Sequence[int] | None = None) -> NDArray:
         """As `Simulation.run`."""
-        wanted = self._wanted(frames)
+        kept = [self.particle_state(nodes) for nodes in self._nodes_at(self._wanted(frames))]
+        return kept[-1] if frames is None else np.array(kept)
+
+    def _nodes_at(self, wanted: list[int]) -> Iterator[NDArray]:
+        """States (M, 4) of the nodes after so many steps each, to be used at once."""
         states = np.zeros((2, *self.start.shape), self.start.dtype)
-        pushes = np.zeros((1, self.nodes), self.start.dtype)
         states[0] = self.start
-        kept, step = [], 0
+        step = 0
         for frame in wanted:
-            self._advance(states, pushes, step, frame, step)
+            self._advance(states, step, frame, step)
             if (frame - step) % 2:
                 states[0] = states[1]
             step = frame
-            kept.append(self.particle_state(states[0]))
-        return kept[-1] if frames is None else np.array(kept)
+            yield states[0]
+
+    def pushed(self, step: int, velocity: Vector) -> LagrangianSimulation:
+        """As `Simulation.pushed`."""
+        (nodes,) = self._nodes_at([step])
+        other = self._from(step)
+        other.start = nodes.copy()
+        other.start[2:] += np.reshape(velocity, (2, 1))
+        return other
 
     def states(self) -> Iterator[NDArray]:
         """As `Simulation.states`."""
         yield from map(self.particle_state, self.node_states())
 
     def node_states(self) -> Iterator[NDArray]:
-        """The states (M, 4) of the nodes after 0, 1, ... steps, one after the other."""
+        """The states (4, M) of the nodes after 0, 1, ... steps, one after the other."""
         states = np.zeros((2, *self.start.shape), self.start.dtype)
-        pushes = np.zeros((1, self.nodes), self.start.dtype)
         states[0] = self.start
         yield self.start
         for step in range(self.steps):
-            self._advance(states, pushes, step, step + 1, step)
+            self._advance(states, step, step + 1, step)
             states[0] = states[1]
             yield states[0].copy()
 
@@ -208,11 +223,10 @@ class LagrangianSimulation(Simulation):
         watcher = _Watcher(self, instants)
         length = min(WATCH, self.steps)
         states = np.zeros((length + 1, *self.start.shape), self.start.dtype)
-        pushes = np.zeros((length, self.nodes), self.start.dtype)
         states[0] = self.start
         for first in range(0, self.steps, WATCH):
             last = min(first + WATCH, self.steps)
-            self._advance(states, pushes, first, last, first)
+            self._advance(states, first, last, first)
             watcher.follow(states, first, last)
             states[0] = states[last - first]
         return Watched(watcher.states, watcher.seen)
@@ -234,15 +248,12 @@ class LagrangianSimulation(Simulation):
         return Indicators(courant, jacobian=smallest, gap=gap, gap_x=gap_x, gap_y=gap_y)
 
     def checkpoints(self, wish: Checkpointing) -> Checkpoints:
-        """As `Simulation.checkpoints`; what is stored are states of nodes and pushes of layers."""
+        """As `Simulation.checkpoints`; what is stored are states of nodes."""
         dtype = self.start.dtype
-        schedule = Schedule.choose(self.steps, 5 * self.nodes * dtype.itemsize, wish)
+        schedule = Schedule.choose(self.steps, 4 * self.nodes * dtype.itemsize, wish)
         arrays: dict[str, tuple[tuple[int, ...], DTypeLike]] = {"state": (self.start.shape, dtype)}
         if schedule.all_stored:
-            arrays = {
-                "states": ((schedule.segment + 1, *self.start.shape), dtype),
-                "pushes": ((schedule.segment, self.nodes), dtype),
-            }
+            arrays = {"states": ((schedule.segment + 1, *self.start.shape), dtype)}
         return Checkpoints(schedule, arrays, wish.store)
 
     def forward(
@@ -297,16 +308,15 @@ class LagrangianForward(Forward):
         schedule, dtype = checkpoints.schedule, simulation.start.dtype
         watcher = _Watcher(simulation, instants)
         self._states = memory.take("nodes", (schedule.segment + 1, *simulation.start.shape), dtype)
-        self._pushes = memory.take("pushes", (schedule.segment, simulation.nodes), dtype)
         self._states[0] = simulation.start
         for index, (first, last) in enumerate(schedule.segments):
             if not schedule.all_stored:
                 checkpoints.write(index, state=self._states[0])
-            simulation._advance(self._states, self._pushes, first, last, first)
+            simulation._advance(self._states, first, last, first)
             watcher.follow(self._states, first, last)
             if last < schedule.steps:
                 if schedule.all_stored:
-                    checkpoints.write(index, states=self._states, pushes=self._pushes)
+                    checkpoints.write(index, states=self._states)
                 self._states[0] = self._states[last - first]
         self.states, self.indicators = watcher.states, watcher.seen
 
@@ -317,7 +327,7 @@ class LagrangianForward(Forward):
         return 0 if schedule.all_stored else len(schedule.segments) - 1
 
     def reverse(self, terminal_adjoints: Mapping[int, NDArray[np.float64]]) -> Gradient:
-        """As `Forward.reverse`; the gradient's state is that of the nodes (M, 4)."""
+        """As `Forward.reverse`; the gradient's state is that of the nodes (4, M)."""
         simulation = self._simulation
         steps, shape = simulation.steps, simulation.initial.shape
         if self._reversed:
@@ -344,14 +354,16 @@ class LagrangianForward(Forward):
                 earlier = (step - first for step in terminal_adjoints if step < first + stop)
                 start = max(0, stop - simulation.steps_per_call, *earlier)
                 lagrangian.advance_lattice_adjoint(
-                    self._states, self._pushes, start, stop, simulation.lattice,
+                    self._states, start, stop, simulation.lattice,
                     simulation.signal[first:last], state_bar, bar, signal_bar[first:last],
                 )  # fmt: skip
                 stop = start
                 if first + start in terminal_adjoints:
                     state_bar += bar_of(first + start)
-        rows = simulation.lattice.rows
-        mass_bar = simulation._folded(bar.mass, simulation.lattice.mirror_axis, rows)
+        lattice = simulation.lattice
+        mass_bar = simulation._folded(
+            bar.mass, lattice.mirror_axis, lattice.columns, 4 * (lattice.groups + 1)
+        )
         volume = simulation.particles.volume
         return Gradient(
             density=volume * (simulation._weights[0] @ mass_bar),
@@ -364,7 +376,6 @@ class LagrangianForward(Forward):
         """Bring the states of a segment back: read them, or recompute them."""
         if self._checkpoints.schedule.all_stored:
             self._states[:] = self._checkpoints.read(index, "states")
-            self._pushes[:] = self._checkpoints.read(index, "pushes")
         else:
             self._states[0] = self._checkpoints.read(index, "state")
-            self._simulation._advance(self._states, self._pushes, first, last, first)
+            self._simulation._advance(self._states, first, last, first)

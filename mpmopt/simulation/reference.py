@@ -65,12 +65,11 @@ def step(simulation: Simulation, state: NDArray, n: int) -> NDArray:
             stencil.append((i, j, spline(d[0] / dx) * spline(d[1] / dx), d))
     nodes = tuple(cells + 1 for cells in scene.grid.cells)
     mass = np.zeros(nodes, state.dtype)
-    q, q_old = np.zeros((2, *nodes), state.dtype), np.zeros((2, *nodes), state.dtype)
+    q = np.zeros((2, *nodes), state.dtype)
     for i, j, w_i, d in stencil:
         np.add.at(mass, (i, j), w_i * m)
         for k in (0, 1):
             np.add.at(q[k], (i, j), w_i * (m * v[k] + A[k, 0] * d[0] + A[k, 1] * d[1]))
-            np.add.at(q_old[k], (i, j), w_i * m * (v[k] + C[k, 0] * d[0] + C[k, 1] * d[1]))
 
     # the ground's layers to grid
     force = np.zeros(nodes, state.dtype)
@@ -84,7 +83,7 @@ def step(simulation: Simulation, state: NDArray, n: int) -> NDArray:
                 np.add.at(q[k], (i, j), w_i * dt * pushed * normal[k])
 
     # grid update
-    u, u_old = np.zeros_like(q), np.zeros_like(q)
+    u = np.zeros_like(q)
     for i, j in zip(*np.nonzero(mass.real > 0.0)):
         u[:, i, j] = q[:, i, j] / mass[i, j] + dt * np.array(scene.gravity)
         if force[i, j].real > 0.0:
@@ -99,19 +98,14 @@ def step(simulation: Simulation, state: NDArray, n: int) -> NDArray:
             if (low <= 1e-6 * dx).all() and (high >= -1e-6 * dx).all():
                 u[:, i, j] = (after - before) / dt
                 break
-        u_old[:, i, j] = q_old[:, i, j] / mass[i, j]
 
-    # grid to particle, and blend
+    # grid to particle
     new = np.zeros_like(state)
     x_new, v_new, C_new, F_new = parts(new)
-    lost = v.copy()
     for i, j, w_i, d in stencil:
         v_new += w_i * u[:, i, j]
         C_new += (4.0 / dx**2) * w_i * u[:, None, i, j] * d
-        lost = lost - w_i * u_old[:, i, j]
     x_new[:] = x + dt * v_new
-    if scene.blend_time > 0.0:
-        v_new += np.exp(-dt / scene.blend_time) * lost
     F_new[:] = F
     return new
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -16,6 +17,7 @@ from mpmopt import kernels
 from mpmopt.errors import DesignError
 from mpmopt.scene import Scene
 from mpmopt.scene.particles import Particles, of_solid
+from mpmopt.scene.parts import Vector
 from mpmopt.simulation.buffers import Memory, Segment
 from mpmopt.simulation.checkpoints import Checkpointing, Checkpoints, Schedule
 from mpmopt.simulation.indicators import WATCH, Indicators, Watched, Watcher
@@ -191,6 +193,32 @@ class Simulation:
             )
         return wanted
 
+    def pushed(self, step: int, velocity: Vector) -> Simulation:
+        """The same body from a step on, with all that it has by then and a velocity more.
+
+        Raises
+        ------
+        DesignError
+            If the step is none before the last.
+        SimulationError
+            As `run`.
+        """
+        (state,) = self.run([step])
+        other = self._from(step)
+        other.initial = state
+        kernels.parts(state).velocity[:] += np.reshape(velocity, (2, 1))
+        return other
+
+    def _from(self, step: int) -> Any:
+        """The same without its first steps, at the old start."""
+        if not 0 <= step < self.steps:
+            raise DesignError(f"step = {step} must be from 0 to {self.steps - 1}")
+        other = copy.copy(self)
+        other.scene = replace(self.scene, steps=self.steps - step, transient=0.0)
+        other.signal = self.signal[step:]
+        other.parameters = self.parameters_of_steps(step, self.steps)
+        return other
+
     def states(self) -> Iterator[NDArray]:
         """The states (12, N) after 0, 1, ... steps, one after the other.
 
@@ -252,11 +280,6 @@ class Simulation:
         return self.parameters._replace(clamps=self.parameters.clamps[first:last])
 
     @property
-    def fields(self) -> int:
-        """Sheets of nodes: two where particles keep a share of their own velocity, else one."""
-        return 2 if self.parameters.keep > 0.0 else 1
-
-    @property
     def steps(self) -> int:
         """Number of steps."""
         return self.scene.steps
@@ -297,7 +320,7 @@ class Simulation:
         groups, dtype = self.data.mass.shape[0], self.initial.dtype
         states, log = (kernels.STATE_SIZE * groups, 4), (groups, 4)
         nodes, _ = self.room
-        grid = (self.fields, nodes, kernels.NODE_SIZE)
+        grid = (nodes, kernels.NODE_SIZE)
         numbers = math.prod(states) + math.prod(log) + math.prod(grid)
         step_bytes = numbers * dtype.itemsize
         schedule = Schedule.choose(self.steps, step_bytes, wish)

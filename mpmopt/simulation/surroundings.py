@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from mpmopt import kernels
@@ -33,7 +31,6 @@ def parameters_of(scene: Scene) -> kernels.Parameters:
         mirror_axis=-1 if scene.mirror is None else scene.mirror.normal,
         mirror_node=0 if scene.mirror is None else round(scene.mirror.position / dx),
         viscous=any(material.viscosity > 0.0 for material in scene.materials),
-        keep=math.exp(-scene.time_step / scene.blend_time) if scene.blend_time else 0.0,
         mass_tolerance=0.0,
     )
 

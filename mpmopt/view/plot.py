@@ -11,10 +11,12 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from mpmopt.assess.forces import Books
+from mpmopt.assess.robustness import Robot, can_be_studied
 from mpmopt.assess.trajectory import Body, Motion, equal_steps, optimised, post_processed, reference
 from mpmopt.errors import SimulationError
 from mpmopt.io.files import replace_file
 from mpmopt.optimisation.history import Optimisation
+from mpmopt.scene import Scene
 from mpmopt.view.draw import (
     Arrows,
     Forces,
@@ -29,6 +31,7 @@ from mpmopt.view.draw import (
     set_view,
     view,
 )
+from mpmopt.view.gait import plot_gait, plot_stride
 from mpmopt.view.schematic import schematic
 
 logger = logging.getLogger(__name__)
@@ -148,6 +151,10 @@ def overview(run: Optimisation) -> Figure:
     return figure
 
 
+def _robot(run: Optimisation) -> Robot:
+    return Robot.of(run.problem(), run.result.x)
+
+
 PICTURES: dict[str, Callable[[Path, Optimisation], None]] = {
     "schematic": lambda path, run: replace_file(path, png(schematic(run.scene))),
     "history": lambda path, run: plot_history(path, run),
@@ -156,12 +163,16 @@ PICTURES: dict[str, Callable[[Path, Optimisation], None]] = {
         path, post_processed(run.problem(), run.result.x)
     ),
     "reference": lambda path, run: plot_motion(path, reference(run.problem(), run.result.x)),
+    "stride": lambda path, run: plot_stride(path, _robot(run)),
+    "gait": lambda path, run: plot_gait(path, _robot(run)),
 }
+GAITS = ("stride", "gait")  # of robots on ground only
 
 
-def picture_files(folder: Path) -> dict[str, Path]:
+def picture_files(folder: Path, scene: Scene) -> dict[str, Path]:
     """The files that `plot_run` writes to a folder, by name."""
-    return {name: folder / f"{name}.png" for name in PICTURES}
+    goes = can_be_studied(scene)
+    return {name: folder / f"{name}.png" for name in PICTURES if goes or name not in GAITS}
 
 
 def plot_run(
@@ -170,8 +181,8 @@ def plot_run(
     """Write all pictures of a run to a folder.
 
     ``schematic.png`` shows the scene, ``design.png``, ``post_processed.png`` and ``reference.png``
-    bodies in motion (`motion`), and ``history.png`` the optimisation. A body that cannot be
-    simulated has no picture.
+    bodies in motion, and ``history.png`` the optimisation; of a robot on ground, ``stride.png`` and
+    ``gait.png`` show the finished one. A body that cannot be simulated has no picture.
 
     Parameters
     ----------
@@ -188,7 +199,7 @@ def plot_run(
         If a file cannot be written.
     """
     run.problem()  # an error before anything is written
-    for name, path in picture_files(folder).items():
+    for name, path in picture_files(folder, run.scene).items():
         try:
             PICTURES[name](path, run)
         except SimulationError as error:
