@@ -142,7 +142,7 @@ def test_forces_are_what_changes_the_momentum_of_a_lattice():
     simulation = falling()
     found, mass = books(simulation), simulation.data.mass.sum()
     *_, end = simulation.node_states()
-    momentum = simulation.lattice.mass @ end[:, 2:]
+    momentum = end[2:] @ simulation.lattice.mass
     weight = found.time[-1] * mass * np.array([0.0, -10.0])
     given = simulation.scene.time_step * found.force.sum(axis=(0, 1)) + weight
     assert given == pytest.approx(momentum, rel=1e-9, abs=1e-12)

@@ -23,7 +23,9 @@ def at_depth(pressure):
     return delta - math.sqrt(2.0 * delta * pressure / kappa)
 
 
-def block(degrees, velocity, seconds, *, gravity=(0.0, -G), gap=None, cells=16, **ground):
+def block(
+    degrees, velocity, seconds, *, gravity=(0.0, -G), gap=None, cells=16, height=HEIGHT, **ground
+):
     """A block on ground that falls to the right by an angle, with a velocity along and across.
 
     It is turned with the ground and a gap above it, or has come to rest on it under the part of
@@ -37,12 +39,12 @@ def block(degrees, velocity, seconds, *, gravity=(0.0, -G), gap=None, cells=16, 
     scene = Scene(
         Grid((2 * cells, cells), 1.0 / cells), dt, round(seconds / dt), gravity=gravity,
         material=material,
-        body=(Solid(LOWER, (LOWER[0] + WIDTH, LOWER[1] + HEIGHT)),),
+        body=(Solid(LOWER, (LOWER[0] + WIDTH, LOWER[1] + height)),),
         ground=(Ground.slope(tuple(POINT), -degrees, **{**LAYER, **ground}),),
     )  # fmt: skip
     particles = discretise(scene)
     local = particles.position - LOWER - (WIDTH / 2, 0.0)
-    local[:, 1] += at_depth(-normal * HEIGHT) if gap is None else gap
+    local[:, 1] += at_depth(-normal * height) if gap is None else gap
     state = at_rest(particles)
     state[:2] = POINT[:, None] + frame.T @ local.T
     if gap is None:
@@ -105,6 +107,25 @@ def test_a_block_that_slides_stops_where_its_energy_is_spent(friction, speed, ce
     _, place, velocity = motion(simulation, frame, (0.0, 1.0))
     assert np.diff(place[0])[0] == pytest.approx(expected, rel=1e-2)
     assert abs(velocity[0, 1]) <= 0.04 * speed  # it still rocks
+
+
+def test_strong_friction_pitches_a_block_and_a_lower_one_stops_as_coulomb_says():
+    # Friction acts at the foot, so it pitches a block by its height. Then the layer does not push
+    # evenly, and the stop is late: no matter of the law of friction.
+    friction, speed = 0.8, 1.2
+    expected, late, tilts = speed**2 / (2.0 * friction * G), [], []
+    for height in (HEIGHT, HEIGHT / 2):
+        simulation, frame = block(
+            0.0, (speed, 0.0), 1.2 * speed / (friction * G), friction=friction, height=height,
+            cells=32,
+        )  # fmt: skip
+        _, place, _ = motion(simulation, frame, (0.0, 1.0))
+        late.append(np.diff(place[0])[0] / expected - 1.0)
+        x, y = simulation.run([simulation.steps // 4])[0][:2]
+        tilts.append(np.polyfit(x, y, 1)[0])
+    assert late[0] >= 0.02
+    assert abs(late[1]) <= 5e-3
+    assert tilts[0] < 2.0 * tilts[1] < -0.01
 
 
 def restitution(alpha):

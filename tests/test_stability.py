@@ -268,14 +268,14 @@ def test_an_impact_that_is_too_fast_has_a_name():
 
 
 def test_contact_shortens_the_radius_in_which_the_gradient_predicts():
-    free = gradients.at_horizon(400, contact=False)
-    touching = gradients.at_horizon(400, contact=True)
+    free = gradients.at_horizon(400, contact="none")
+    touching = gradients.at_horizon(400, contact="wall")
     assert free["radius"] >= 1e-3
     assert touching["radius"] < free["radius"]
 
 
 def test_single_precision_loses_little_within_a_few_hundred_steps():
-    row = gradients.at_horizon(400, contact=False)
+    row = gradients.at_horizon(400, contact="none")
     assert 0.0 < row["single_value_error"] <= 1e-5
     assert 0.0 < row["single_gradient_error"] <= 1e-3
 

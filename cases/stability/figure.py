@@ -21,6 +21,7 @@ Tables = Mapping[str, Rows]
 LIMIT: dict[str, Any] = {"color": "0.35", "ls": "--", "lw": 1.0}  # how theory is drawn
 SAFE: dict[str, Any] = {"color": "tab:green", "alpha": 0.12, "lw": 0.0}
 FAILED = "#b2182b"
+CONTACTS = {"wall": ("contact", "C3"), "layer": ("layer", "C2"), "none": ("no contact", "C0")}
 
 
 def column(rows: Rows, key: str) -> np.ndarray:
@@ -239,7 +240,7 @@ def adversary(axes: Axes, tables: Tables) -> None:
 def sizes(axes: Axes, tables: Tables) -> None:
     """Norm of the gradient, and the error of single precision, over the horizon."""
     for (contact,), rows in groups(tables["gradients"], "contact").items():
-        name, colour = ("contact", "C3") if contact else ("no contact", "C0")
+        name, colour = CONTACTS[contact]
         steps = column(rows, "steps")
         axes.loglog(
             steps, column(rows, "gradient"), ".-", color=colour, label=f"|gradient|, {name}"
@@ -256,7 +257,7 @@ def sizes(axes: Axes, tables: Tables) -> None:
 def radii(axes: Axes, tables: Tables) -> None:
     """How far L is linear."""
     for (contact,), rows in groups(tables["gradients"], "contact").items():
-        name, colour = ("contact", "C3") if contact else ("no contact", "C0")
+        name, colour = CONTACTS[contact]
         axes.loglog(column(rows, "steps"), column(rows, "radius"), ".-", color=colour, label=name)
     axes.axhline(0.1, **LIMIT)
     note(axes, 25, 0.105, "move limit of the optimiser")

@@ -8,20 +8,27 @@ from walker import slanted_legs, walker
 
 from mpmopt.assess.verify import contact_free
 from mpmopt.design.problem import Problem
-from mpmopt.scene import Scene
+from mpmopt.scene import Ground, Scene
 from mpmopt.simulation.simulation import Precision
 from stability.common import Array, Found, Line, Measured, Points
 
 HORIZONS = (25, 50, 100, 200, 400, 800, 1250, 2500, 5000)
 STEPS = 10.0 ** -np.arange(1.0, 7.1, 0.5)  # of the design variables, in which radii are counted
 ONE_PERCENT = 0.01
+NAMES = {
+    "wall": "with contact", "layer": "on a layer, viscous", "none": "without contact",
+}  # fmt: skip
 
 
-def scene_of(steps: int, contact: bool) -> Scene:
-    """The first steps of the preview's walker with heavy void, or of it without a floor."""
+def scene_of(steps: int, contact: str) -> Scene:
+    """The first steps of a walker with heavy void: on a wall, on a layer and viscous, or free."""
     scene = walker(64, 8e-4)
     scene = replace(scene, steps=steps, material=replace(scene.material, void_density=1e-2))
-    return scene if contact else contact_free(scene, steps)
+    if contact == "layer":
+        ground = Ground.floor(4 / 64, friction=0.5, thickness=1 / 64)
+        material = replace(scene.material, viscosity=0.02)
+        return replace(scene, walls=(), ground=(ground,), material=material)
+    return scene if contact == "wall" else contact_free(scene, steps)
 
 
 def plain(scene: Scene, precision: Precision = "double") -> Problem:
@@ -53,7 +60,7 @@ def radius(problem: Problem, x: Array, value: float, gradient: Array) -> float:
     return good
 
 
-def at_horizon(steps: int, contact: bool) -> dict[str, Any]:
+def at_horizon(steps: int, contact: str) -> dict[str, Any]:
     """One horizon: sizes, errors of single precision, and the radius."""
     scene = scene_of(steps, contact)
     problem = plain(scene)
@@ -70,10 +77,10 @@ def at_horizon(steps: int, contact: bool) -> dict[str, Any]:
 
 
 def points(quick: bool) -> Points:
-    """All horizons, with contact and without."""
+    """All horizons, with both laws of contact and without."""
     horizons = [
         {"steps": steps, "contact": contact}
-        for contact in (True, False)
+        for contact in NAMES
         for steps in (HORIZONS[:7:2] if quick else HORIZONS)
     ]
     return {at_horizon: horizons}
@@ -83,10 +90,9 @@ def measure(measured: Measured) -> Found:
     """What grows with the horizon."""
     rows = measured[at_horizon]
     lines = []
-    for contact in (True, False):
-        mine = [r for r in rows if r["contact"] is contact]
+    for contact, name in NAMES.items():
+        mine = [r for r in rows if r["contact"] == contact]
         first, last = mine[0], mine[-1]
-        name = "with contact" if contact else "without contact"
         steps = f"{first['steps']} and {last['steps']} steps"
         lines.append(
             Line(
@@ -99,7 +105,7 @@ def measure(measured: Measured) -> Found:
         lines.append(
             Line(
                 f"Radius of the Taylor expansion, {name}",
-                "kinks where contact begins or ends" if contact else "smooth",
+                "smooth" if contact == "none" else "kinks where contact begins or ends",
                 f"L is linear within 1 % up to changes of {first['radius']:.0e} and "
                 f"{last['radius']:.0e} after {steps}",
                 "Nothing is said: a longer move may go back; the optimiser then shortens moves.",

@@ -396,7 +396,7 @@ class _Account:
 
 
 class _LatticeAccount(_Account):
-    """The same of a total Lagrangian body, whose states are those of its nodes (M, 4).
+    """The same of a total Lagrangian body, whose states are those of its nodes (4, M).
 
     A state's velocity is what led to its place: in the middle of the way both belong together, and
     from there to the next middle a node goes dt times the mean of its old and new velocity. So the
@@ -408,15 +408,27 @@ class _LatticeAccount(_Account):
     def _prepare(self) -> None:
         lattice = self.simulation.lattice
         # Nodes beside the mirror plane have their image's mass too, and stand for half a node each.
-        shares = np.ones((lattice.columns + 2, lattice.rows + 2))
+        shares = np.ones(self._lines)
         if lattice.mirror_axis >= 0:
-            beside = shares[-2:] if lattice.mirror_axis == 0 else shares[:, -2:]
-            beside[:] = 0.5
+            self._beside(shares)[:] = 0.5
         m = lattice.mass.real.astype(float)
         self._per_m = np.divide(1.0, m, out=np.zeros_like(m), where=m > 0.0)
         self._m = m * shares.ravel()
         if self.scene.mirror is not None:
             self._m = np.tile(self._m, 2)
+
+    @property
+    def _lines(self) -> tuple[int, int]:
+        """Nodes along y and x, which are stored so."""
+        return self.simulation.lattice.rows + 2, 4 * self.simulation.lattice.groups + 4
+
+    def _beside(self, lines: Array) -> Array:
+        """The two lines of nodes beside the mirror plane."""
+        lattice = self.simulation.lattice
+        columns = slice(lattice.columns, lattice.columns + 2)
+        return (
+            lines[..., columns].swapaxes(-1, -2) if lattice.mirror_axis == 0 else lines[..., -2:, :]
+        )
 
     def states(self) -> Iterator[Array]:
         for nodes in self.simulation.node_states():
@@ -424,9 +436,9 @@ class _LatticeAccount(_Account):
 
     def _nodes(self, nodes: Array) -> Array:
         """State (4, M) of nodes and their images."""
-        mirror, both = self.scene.mirror, nodes.T
+        mirror, both = self.scene.mirror, nodes
         if mirror is not None:
-            image = nodes.T.copy()
+            image = nodes.copy()
             image[mirror.normal] = 2.0 * mirror.position - image[mirror.normal]
             image[2 + mirror.normal] *= -1.0
             both = np.concatenate([both, image], axis=1)
@@ -437,7 +449,7 @@ class _LatticeAccount(_Account):
 
     def _midway(self, state: Array) -> tuple[Array, Array]:
         middle = state.copy()
-        middle[:, :2] -= 0.5 * self.scene.time_step * middle[:, 2:]
+        middle[:2] -= 0.5 * self.scene.time_step * middle[2:]
         x, _, _, F = kernels.parts(self._both(self.simulation.particle_state(middle)))
         return x, F
 
@@ -456,8 +468,7 @@ class _LatticeAccount(_Account):
         simulation, dt = self.simulation, self.scene.time_step
         half = self.simulation.particle_state(old)
         x, _, _, F = kernels.parts(self._both(half))
-        velocity = old.copy()
-        velocity[:, :2] = velocity[:, 2:]
+        velocity = np.tile(old[2:], (2, 1))
         rate = kernels.parts(self._both(simulation.particle_state(velocity)))[3]
 
         # Viscous stress, on the strain from the middle of one step to that of the next.
@@ -477,11 +488,10 @@ class _LatticeAccount(_Account):
             N.T @ push[:, :count].T - Gx.T @ stress[:, 0].T - Gy.T @ stress[:, 1].T,
             (N.T @ borne[:, :count].sum(axis=0))[:, None],
         ], axis=1)  # fmt: skip
-        self._fold(force)
-        free = old[:, 2:] + dt * (force[:, :2] * self._per_m[:, None] + self.scene.gravity)
-        held = (force[:, 2] > 0.0) & (self._per_m > 0.0)
+        force = self._folded(force.T)
+        free = old[2:] + dt * (force[:2] * self._per_m + np.reshape(self.scene.gravity, (2, 1)))
         taken = old.copy()
-        taken[:, 2:] = np.where(held[:, None], new[:, 2:] - free, 0.0)
+        taken[2:] = np.where((force[2] > 0.0) & (self._per_m > 0.0), new[2:] - free, 0.0)
 
         places, lost, before, after = (self._nodes(each) for each in (old, taken, old, new))
         lines = [layer.line.distance(places[:2]) for layer in self.layers]
@@ -507,16 +517,17 @@ class _LatticeAccount(_Account):
         sS = np.einsum("k,kp,kab->abp", signal, self.actuated, self.stress)
         return self.volume * (elastic + viscous + _product(F, sS))
 
-    def _fold(self, records: Array) -> None:
-        """Add to nodes beside the mirror plane what the mirrored half puts there."""
-        lattice = self.simulation.lattice
-        axis = lattice.mirror_axis
-        if axis >= 0:
-            lines = records.reshape(lattice.columns + 2, lattice.rows + 2, -1)
-            beside = lines[-2:] if axis == 0 else lines[:, -2:].swapaxes(0, 1)
-            signs = np.ones(records.shape[1])
-            signs[axis] = -1.0
-            beside[:] = beside + signs * beside[::-1]
+    def _folded(self, forces: Array) -> Array:
+        """Forces (3, M) with what the mirrored half puts on nodes beside the mirror plane."""
+        axis = self.simulation.lattice.mirror_axis
+        if axis < 0:
+            return forces
+        lines = forces.reshape(3, *self._lines).copy()
+        signs = np.ones((3, 1, 1))
+        signs[axis] = -1.0
+        beside = self._beside(lines)
+        beside[:] = beside + signs * beside[:, ::-1]
+        return lines.reshape(3, -1)
 
 
 def _mean(places: Array, weights: Array) -> Array:

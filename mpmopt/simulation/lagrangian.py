@@ -259,7 +259,7 @@ class LagrangianSimulation(Simulation):
         yield from map(self.particle_state, self.node_states())
 
     def node_states(self) -> Iterator[NDArray]:
-        """The states (M, 4) of the nodes after 0, 1, ... steps, one after the other."""
+        """The states (4, M) of the nodes after 0, 1, ... steps, one after the other."""
         states = np.zeros((2, *self.start.shape), self.start.dtype)
         states[0] = self.start
         yield self.start
