@@ -195,7 +195,9 @@ def test_sweep_is_a_name_of_the_package():
     assert Outcome({}).error == ""
 
 
-def test_an_interrupt_waits_until_the_executor_has_let_go_of_its_locks(store):
+def test_an_interrupt_waits_until_the_executor_has_let_go_of_its_locks(store, request):
+    handler = signal.signal(signal.SIGINT, signal.default_int_handler)  # may be ignored
+    request.addfinalizer(lambda: signal.signal(signal.SIGINT, handler))
     left = []
 
     class Interrupted(ThreadPoolExecutor):
