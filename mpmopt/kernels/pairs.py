@@ -20,9 +20,11 @@ from mpmopt.kernels.overlap import FAR
 # Distance d_c below which two particles push each other, in cells.
 REACH = 0.75
 # By how much nearness reaches beyond that, in cells: of particles, and of cells.
-SKIN, WIDE_SKIN = 0.3 * REACH, 1.0
+SKIN, WIDE_SKIN = 0.3 * REACH, 1.5
 # Part of a skin that a node may move before a list is renewed: half, less what is rounding.
 HALF = 0.499
+# Cells of a block along each axis. Neighbours by an edge hold nothing that was far apart.
+SIDE = 2
 # Where nodes are that were nowhere yet.
 NOWHERE = 1e150
 # gamma_0, the share of the solid's stiffness below which a particle pushes nothing.
@@ -39,9 +41,12 @@ class Touch(NamedTuple):
     corner: NDArray[np.int64]  # (2 C, 2) place of a cell, and of its image, on the lattice
     first: NDArray[np.int64]  # (C,) first node of a cell
     offset: NDArray[np.int64]  # (9,) of the cell's nodes from the first
+    values: NDArray[np.float64]  # (n, 3) weights of a cell's nodes along an axis
     weights: NDArray[np.float64]  # (n n, 9) N_ip of the nodes of a particle's cell
     grip: NDArray  # (C, n n) g of the particles
     cells: NDArray[np.int64]  # those with a grip above zero
+    blocks: NDArray[np.int64]  # (B, 4) these cells, `SIDE` by `SIDE`, or -1
+    block_corner: NDArray[np.int64]  # (2 B, 2) place of the first cell of a block, and of its image
     nodes: NDArray[np.float64]  # (M,) 1 for the nodes of these cells, else 0
     alone: NDArray[np.float64]  # (2, M) where the nodes were when no cells were near; a cache
 
@@ -57,6 +62,7 @@ class Near(NamedTuple):
     at: NDArray[np.float64]  # (2, M) nodes when near particles were looked for
     pairs: NDArray[np.int64]  # (., 2) of particles
     members: NDArray[np.int64]  # cells that have particles in pairs
+    room: float  # by how much others of these cells' pairs must come nearer to touch
 
 
 @jit
@@ -112,6 +118,7 @@ def nowhere(touch: Any) -> Near:
         none,
         np.empty((0, 2), np.int64),
         np.empty(0, np.int64),
+        0.0,
     )
 
 
@@ -119,101 +126,159 @@ def nowhere(touch: Any) -> Near:
 def look_for_cells(nodes, touch):
     """Pairs of cells whose particles may come to touch: own cells, and own ones with images.
 
-    Boxes of their particles are sorted into bins by their middles; bins are as wide as what is near
-    may be apart. Pairs are in ascending order.
+    Blocks of cells are sorted into bins by the middles of their boxes. Bins are as wide as what is
+    near may be apart. Pairs are in ascending order.
     """
-    count, reach = len(touch.grip), (REACH + WIDE_SKIN) * touch.dx
-    own = len(touch.cells)
-    boxes = np.empty((2 * own, 4))
-    cells = np.empty(2 * own, np.int64)
+    count, reach, own = len(touch.grip), (REACH + WIDE_SKIN) * touch.dx, len(touch.blocks)
+    of_cells = boxes_of_cells(nodes, touch)
+    boxes, which, units = boxes_of_blocks(of_cells, touch, reach)
     low_x = low_y = math.inf
     high_x = high_y = -math.inf
     width = 0.0
-    for n in range(own):
-        c = touch.cells[n]
-        x0 = y0 = math.inf
-        x1 = y1 = -math.inf
-        for k in range(touch.grip.shape[1]):
-            if touch.grip[c, k].real > 0.0:
-                x, y = position(nodes, touch, c, k)
-                x0, x1, y0, y1 = min(x0, x), max(x1, x), min(y0, y), max(y1, y)
-        cells[n] = c
-        boxes[n, 0], boxes[n, 1], boxes[n, 2], boxes[n, 3] = x0, y0, x1, y1
-        width = max(width, x1 - x0, y1 - y0)
+    for n in range(units):
+        x0, y0, x1, y1 = boxes[n, 0], boxes[n, 1], boxes[n, 2], boxes[n, 3]
         low_x, high_x = min(low_x, x0), max(high_x, x1)
         low_y, high_y = min(low_y, y0), max(high_y, y1)
-    units = own
-    if touch.axis >= 0:
-        high = high_x if touch.axis == 0 else high_y
-        for n in range(own):
-            if boxes[n, 2 + touch.axis] + high + reach > 2.0 * touch.plane:
-                cells[units] = count + cells[n]
-                x0, y0 = imaged(boxes[n, 0], boxes[n, 1], touch)
-                x1, y1 = imaged(boxes[n, 2], boxes[n, 3], touch)
-                boxes[units, 0], boxes[units, 2] = min(x0, x1), max(x0, x1)
-                boxes[units, 1], boxes[units, 3] = min(y0, y1), max(y0, y1)
-                low_x, high_x = min(low_x, boxes[units, 0]), max(high_x, boxes[units, 2])
-                low_y, high_y = min(low_y, boxes[units, 1]), max(high_y, boxes[units, 3])
-                units += 1
+        width = max(width, x1 - x0, y1 - y0)
     most = 2 * int(math.sqrt(units)) + 1
     width += reach
     columns = int(min((high_x - low_x) / width, most)) + 1
     rows = int(min((high_y - low_y) / width, most)) + 1
-    width_x = max(width, (high_x - low_x) / columns)
-    width_y = max(width, (high_y - low_y) / rows)
+    per_x = 1.0 / max(width, (high_x - low_x) / columns)
+    per_y = 1.0 / max(width, (high_y - low_y) / rows)
     newest, older = np.full(columns * rows, -1), np.empty(units, np.int64)
-    found, partners = np.empty((64, 2), np.int64), np.empty(units, np.int64)
-    total = 0
-    # From the last to the first, so that those met before have larger numbers; images come first.
-    for n in range(units - 1, -1, -1):
-        x, y = 0.5 * (boxes[n, 0] + boxes[n, 2]), 0.5 * (boxes[n, 1] + boxes[n, 3])
-        i, j = (
-            min(int((x - low_x) / width_x), columns - 1),
-            min(int((y - low_y) / width_y), rows - 1),
-        )
-        if cells[n] < count:
-            size = 0
-            for a in range(max(i - 1, 0), min(i + 2, columns)):
-                for b in range(max(j - 1, 0), min(j + 2, rows)):
-                    m = newest[a * rows + b]
-                    while m >= 0:
-                        # Most are near in the reference configuration.
-                        if are_far(touch, cells[n], cells[m]):
-                            gap_x = max(boxes[m, 0] - boxes[n, 2], boxes[n, 0] - boxes[m, 2], 0.0)
-                            gap_y = max(boxes[m, 1] - boxes[n, 3], boxes[n, 1] - boxes[m, 3], 0.0)
-                            near = gap_x * gap_x + gap_y * gap_y < reach * reach
-                            # A cell and another's image are the other and this one's image.
-                            if near and cells[m] % count >= cells[n]:
-                                partners[size] = cells[m]
-                                size += 1
-                        m = older[m]
-            partners[:size].sort()
-            while total + size > len(found):
-                found = np.concatenate((found, found))
-            for m in range(size):
-                # In descending order, which is turned round at the end.
-                found[total, 0], found[total, 1] = cells[n], partners[size - 1 - m]
-                total += 1
+    found, total = np.empty(64, np.int64), 0
+    for n in range(units - 1, -1, -1):  # images first, so that own blocks meet all of them
+        i = int((0.5 * (boxes[n, 0] + boxes[n, 2]) - low_x) * per_x)
+        j = int((0.5 * (boxes[n, 1] + boxes[n, 3]) - low_y) * per_y)
+        i, j = min(i, columns - 1), min(j, rows - 1)
+        for a in range(max(i - 1, 0), min(i + 2, columns)):
+            for b in range(max(j - 1, 0), min(j + 2, rows)):
+                m = newest[a * rows + b]
+                while m >= 0 and n < own:
+                    far = are_far(touch.block_corner, which[n], which[m], SIDE - 1, touch)
+                    if far and are_near(boxes, n, boxes, m, reach):
+                        while total + 16 > len(found):
+                            found = np.concatenate((found, found))
+                        total = add_cells(found, total, which[n], which[m], of_cells, touch, reach)
+                    m = older[m]
         older[n] = newest[i * rows + j]
         newest[i * rows + j] = n
-    return found[:total][::-1].copy()
+    keys = np.sort(found[:total])
+    pairs = np.empty((total, 2), np.int64)
+    for n in range(total):
+        pairs[n, 0], pairs[n, 1] = keys[n] // (2 * count), keys[n] % (2 * count)
+    return pairs
+
+
+@loop_jit
+def boxes_of_cells(nodes, touch):
+    """Boxes (2 C, 4) about the particles of all cells and images: x0, y0, x1, y1."""
+    count, M, step = len(touch.grip), nodes.shape[1], touch.offset[1]
+    last = M - touch.offset[8]
+    sums, ends = np.empty(M), np.empty((4, M))
+    ends[:2], ends[2:] = math.inf, -math.inf
+    for axis in range(2):
+        along, low, high = nodes[axis], ends[axis], ends[2 + axis]
+        for b in range(touch.per_cell):
+            v0, v1, v2 = touch.values[b, 0], touch.values[b, 1], touch.values[b, 2]
+            for i in range(M - 2 * step):
+                sums[i] = v0 * along[i] + v1 * along[i + step] + v2 * along[i + 2 * step]
+            for a in range(touch.per_cell):
+                w0, w1, w2 = touch.values[a, 0], touch.values[a, 1], touch.values[a, 2]
+                for i in range(last):
+                    x = w0 * sums[i] + w1 * sums[i + 1] + w2 * sums[i + 2]
+                    low[i] = x if x < low[i] else low[i]
+                    high[i] = x if x > high[i] else high[i]
+    boxes = np.empty((2 * count, 4))
+    for c in touch.cells:
+        i = touch.first[c]
+        for k in range(4):
+            boxes[c, k] = ends[k, i]
+        if touch.axis >= 0:
+            image_box(boxes, c, boxes, count + c, touch)
+    return boxes
 
 
 @jit
-def are_far(touch, a, b):
-    """Whether any particles of two cells were farther apart than what is one part."""
-    rim = 1.0 - 1.0 / touch.per_cell
-    i = abs(touch.corner[a, 0] - touch.corner[b, 0]) + rim
-    j = abs(touch.corner[a, 1] - touch.corner[b, 1]) + rim
+def image_box(boxes, n, images, m, touch):
+    """Writes the box of an image."""
+    x0, y0 = imaged(boxes[n, 0], boxes[n, 1], touch)
+    x1, y1 = imaged(boxes[n, 2], boxes[n, 3], touch)
+    images[m, 0], images[m, 2] = min(x0, x1), max(x0, x1)
+    images[m, 1], images[m, 3] = min(y0, y1), max(y0, y1)
+
+
+@loop_jit
+def boxes_of_blocks(of_cells, touch, reach):
+    """Boxes of blocks and of those images that may be near to any; which they are; their number."""
+    own = len(touch.blocks)
+    boxes, which, units = np.empty((2 * own, 4)), np.empty(2 * own, np.int64), own
+    high = -math.inf
+    for n in range(own):
+        x0 = y0 = math.inf
+        x1 = y1 = -math.inf
+        for c in touch.blocks[n]:
+            if c >= 0:
+                x0, y0 = min(x0, of_cells[c, 0]), min(y0, of_cells[c, 1])
+                x1, y1 = max(x1, of_cells[c, 2]), max(y1, of_cells[c, 3])
+        boxes[n, 0], boxes[n, 1], boxes[n, 2], boxes[n, 3] = x0, y0, x1, y1
+        which[n] = n
+        high = max(high, x1 if touch.axis == 0 else y1)
+    if touch.axis >= 0:
+        for n in range(own):
+            if boxes[n, 2 + touch.axis] + high + reach > 2.0 * touch.plane:
+                image_box(boxes, n, boxes, units, touch)
+                which[units] = own + n
+                units += 1
+    return boxes, which, units
+
+
+@jit
+def are_near(boxes, n, others, m, reach):
+    """Whether two boxes are nearer than `reach`."""
+    x = max(others[m, 0] - boxes[n, 2], boxes[n, 0] - others[m, 2], 0.0)
+    y = max(others[m, 1] - boxes[n, 3], boxes[n, 1] - others[m, 3], 0.0)
+    return x * x + y * y < reach * reach
+
+
+@jit
+def add_cells(found, total, n, m, boxes, touch, reach):
+    """Adds keys of near cells of block n and of block or image m; returns how many there are."""
+    count, own = len(touch.grip), len(touch.blocks)
+    shift = count if m >= own else 0
+    for c in touch.blocks[n]:
+        for d in touch.blocks[m % own]:
+            # A cell and another's image are the other and this one's image: one of them counts.
+            if c >= 0 and d >= 0 and (d >= c or shift == 0):
+                far = are_far(touch.corner, c, d + shift, 0, touch)
+                if far and are_near(boxes, c, boxes, d + shift, reach):
+                    found[total] = min(c, d) * 2 * count + max(c, d) + shift
+                    total += 1
+    return total
+
+
+@jit
+def are_far(corner, a, b, more, touch):
+    """Whether particles of two cells were farther apart than what is one part; or of two blocks.
+
+    Blocks have `more` cells along each axis than one, and `corner` is that of the first.
+    """
+    rim = more + 1.0 - 1.0 / touch.per_cell
+    i = abs(corner[a, 0] - corner[b, 0]) + rim
+    j = abs(corner[a, 1] - corner[b, 1]) + rim
     return i * i + j * j > FAR * FAR
 
 
 @loop_jit
 def look_for_particles(nodes, touch, cells):
-    """Pairs of particles of near cells that may come to touch, and the cells that they are of."""
+    """Pairs of particles of near cells that may come to touch, and the cells that they are of.
+
+    And by how much the nearest of the other pairs must come nearer to touch.
+    """
     count, size = touch.grip.shape
     reach, far = (REACH + SKIN) * touch.dx, (FAR * touch.per_cell) ** 2
-    found, total = np.empty((64, 2), np.int64), 0
+    found, total, others = np.empty((64, 2), np.int64), 0, math.inf
     there = np.zeros(count, np.bool_)
     place, last = np.empty((2, size, 2)), -1
     for n in range(len(cells)):
@@ -230,17 +295,22 @@ def look_for_particles(nodes, touch, cells):
         for k in range(size):
             for m in range(k if a == own else 0, size):
                 dx, dy = place[0, k, 0] - place[1, m, 0], place[0, k, 1] - place[1, m, 1]
-                if dx * dx + dy * dy < reach * reach:
+                square = dx * dx + dy * dy
+                if square < max(reach * reach, others):
                     i, j = site(touch, a, k)
                     p, q = site(touch, b, m)
                     apart = (i - p) ** 2 + (j - q) ** 2 > far
                     if apart and touch.grip[a, k].real > 0.0 and touch.grip[own, m].real > 0.0:
+                        if square >= reach * reach:
+                            others = square
+                            continue
                         if total == len(found):
                             found = np.concatenate((found, found))
                         found[total, 0], found[total, 1] = a * size + k, b * size + m
                         total += 1
                         there[a] = there[own] = True
-    return found[:total].copy(), np.nonzero(there)[0]
+    room = math.sqrt(others) - REACH * touch.dx
+    return found[:total].copy(), np.nonzero(there)[0], room
 
 
 @jit
@@ -260,11 +330,11 @@ def renewed(near: Any, nodes: NDArray, touch: Any) -> Near:
         cells = look_for_cells(at, touch)
         if len(cells) == 0:
             touch.alone[:] = at
-        near = Near(at, cells, old.at, old.pairs, old.members)
-    if len(near.cells) > 0 and moved(nodes, near.at, touch, HALF * SKIN * touch.dx):
+        near = Near(at, cells, old.at, old.pairs, old.members, old.room)
+    if len(near.cells) > 0 and moved(nodes, near.at, touch, HALF * near.room):
         at = places(nodes)
-        pairs, members = look_for_particles(at, touch, near.cells)
-        near = Near(near.cells_at, near.cells, at, pairs, members)
+        pairs, members, room = look_for_particles(at, touch, near.cells)
+        near = Near(near.cells_at, near.cells, at, pairs, members, room)
     return near
 
 
