@@ -1,7 +1,6 @@
 """The smallest version of the command that asks whether the grid matters."""
 
 import csv
-from dataclasses import replace
 
 import mesh_independence
 import numpy as np

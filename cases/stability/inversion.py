@@ -1,6 +1,6 @@
 """Inversion: the generalized vortex, a ring whose inside is turned by a body force."""
 
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
