@@ -114,6 +114,7 @@ def test_a_step_is_what_its_equations_say(rng, per_cell):
     [
         {},
         {"ground": (Ground(((0.0, 4 * C), (1.0, 4 * C)), friction="stick", thickness=C),)},
+        {"ground": (Ground(((0, 0), (4.6 * C, 4 * C), (1, 0)), friction=0.4, thickness=C),)},
         {"particles_per_cell": 3, "time_step": 2e-3},
         {"transient": 0.1},
         {"material": Material(void_density=1e-2)},
