@@ -391,7 +391,7 @@ def horizons(bench: Bench) -> list[dict[str, str]]:
     """How the gradient's error grows with the simulated time: n = 64 and 128 against 256."""
     where = [(name, duration) for name in ROBOTS for duration in (0.25, 0.5, 1.0)]
     cells = (64, 128, 256)
-    courants = {name: nearest_possible(name, (256, 0.6, PLAIN))[1] for name in ROBOTS}
+    courants = {name: nearest_possible(name, REFERENCE)[1] for name in ROBOTS}
     measured = iter(
         bench.measure(
             [(name, n, courants[name], PLAIN) for name, _ in where for n in cells],
@@ -431,7 +431,7 @@ def travels(points: Sequence[Point]) -> list[dict[str, str]]:
             line = {
                 p.courant: p.travel_ratio
                 for p in points
-                if (p.scene, p.choice, p.n) == (name, PLAIN.name, n)
+                if (p.scene, p.choice, p.n) == (name, PLAIN.name, n) and not p.measured.failure
             }
             if not line:
                 continue

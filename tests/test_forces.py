@@ -273,6 +273,8 @@ def test_arrows_end_where_forces_act_and_are_as_long_as_these_are():
             assert np.all((forces.box[0] <= tail) & (tail <= forces.box[1]))
             shown += 1
     assert shown >= 4
+    elsewhere = Forces.of([motion], [replace(found, place=found.place - 1.0)])
+    assert elsewhere.box[0, 1] < forces.box[0, 1] - 0.5
     hidden = replace(found, place=np.full_like(found.place, np.nan))
     bare, pushed = (Screen([motion], 1.0, [each]).frame(5) for each in (hidden, found))
     assert bare.shape == pushed.shape
