@@ -3,14 +3,13 @@
 import copy
 import inspect
 import reprlib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from numbers import Real
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from scipy.optimize import Bounds, LinearConstraint, NonlinearConstraint, OptimizeResult
-from scipy.optimize._numdiff import approx_derivative
 
 from mpmopt.optimisation.mma import (
     EPSILON,
@@ -30,12 +29,8 @@ FADED = 1e-6  # a gradient so much smaller than the largest seen moves x little:
 class _Rows:
     """A constraint of scipy.optimize as rows g(x) <= 0: lower limits first, then upper."""
 
-    def __init__(self, name: str, constraint: Any, x0: Array, lower: Array, upper: Array) -> None:
-        self.name, self.lower, self.upper = name, lower, upper
-        self.jac: Any = "2-point"
-        self.rel_step: Any = None
-        self.args: tuple[Any, ...] | list[Any] = ()
-        limits: tuple[Any, Any]
+    def __init__(self, name: str, constraint: Any, x0: Array) -> None:
+        self.name = name
         if isinstance(constraint, LinearConstraint):
             matrix = np.atleast_2d(_dense(f"the matrix of {name}", constraint.A))
             if matrix.shape[1] != x0.size:
@@ -44,36 +39,30 @@ class _Rows:
                     "variables: give it one column for each"
                 )
             self.fun: Any = lambda x: matrix @ x
-            self.jac = lambda x: matrix
-            limits = constraint.lb, constraint.ub
+            self.jac: Any = lambda x: matrix
         elif isinstance(constraint, NonlinearConstraint):
             self.fun, self.jac = constraint.fun, constraint.jac
-            self.rel_step = constraint.finite_diff_rel_step
-            limits = constraint.lb, constraint.ub
-        elif isinstance(constraint, Mapping) and "type" in constraint and "fun" in constraint:
-            limits = 0.0, self._take_mapping(constraint)
         else:
             raise MMAError(
-                f"{name} is {reprlib.repr(constraint)}: pass a LinearConstraint, a "
-                "NonlinearConstraint, or a dict with 'type': 'ineq' and 'fun'"
+                f"{name} is {reprlib.repr(constraint)}: pass a LinearConstraint or a "
+                "NonlinearConstraint"
             )
-        if np.any(getattr(constraint, "keep_feasible", False)):
+        if np.any(constraint.keep_feasible):
             raise MMAError(
                 f"{name} has keep_feasible=True, but moving asymptotes may violate a constraint "
                 "on their way: leave it out, and let the functions stand such points"
             )
-        if not callable(self.fun):
-            raise MMAError(f"the fun of {name} is {self.fun!r}: pass a callable")
-        if not (callable(self.jac) or str(self.jac) in ("2-point", "3-point", "cs")):
-            raise MMAError(
-                f"the jac of {name} is {reprlib.repr(self.jac)}: pass a callable, or '2-point', "
-                "'3-point' or 'cs'"
-            )
-        self.size = np.size(self.fun(x0.copy(), *self.args))
+        for what, function in (("fun", self.fun), ("jac", self.jac)):
+            if not callable(function):
+                raise MMAError(
+                    f"the {what} of {name} is {reprlib.repr(function)}: pass a callable; there are "
+                    "no finite differences"
+                )
+        self.size = np.size(self.fun(x0.copy()))
         self.components(x0)  # refuses what is no vector
         self.low, self.high = (
             _spread(f"the {side} limit of {name}", value, self.size, "components")
-            for side, value in zip(("lower", "upper"), limits, strict=True)
+            for side, value in (("lower", constraint.lb), ("upper", constraint.ub))
         )
         if np.any(self.low >= self.high):
             i = int(np.argmax(self.low >= self.high))
@@ -85,29 +74,9 @@ class _Rows:
         self.has_low, self.has_high = np.isfinite(self.low), np.isfinite(self.high)
         self.count = int(np.sum(self.has_low) + np.sum(self.has_high))
 
-    def _take_mapping(self, constraint: Mapping[str, Any]) -> float:
-        """Take its function, Jacobian matrix and arguments, and return its upper limit."""
-        kind = str(constraint["type"]).lower()
-        if kind not in ("ineq", "eq"):
-            raise MMAError(
-                f"the type of {self.name} is {constraint['type']!r}: 'ineq' is what there is"
-            )
-        unknown = sorted(str(key) for key in set(constraint) - {"type", "fun", "jac", "args"})
-        if unknown:
-            raise MMAError(
-                f"{self.name} has the unknown key {', '.join(unknown)}: the keys are type, fun, "
-                "jac, args"
-            )
-        self.args = constraint.get("args", ())
-        if not isinstance(self.args, tuple | list):
-            raise MMAError(f"the args of {self.name} are {reprlib.repr(self.args)}: pass a tuple")
-        self.fun, jac = constraint["fun"], constraint.get("jac")
-        self.jac = "2-point" if jac is None or jac is False else jac
-        return np.inf if kind == "ineq" else 0.0
-
     def components(self, x: Array) -> Array:
         """The values of its function, one for each component."""
-        values = np.atleast_1d(real(f"the value of {self.name}", self.fun(x.copy(), *self.args)))
+        values = np.atleast_1d(real(f"the value of {self.name}", self.fun(x.copy())))
         if values.shape != (self.size,):
             raise MMAError(
                 f"the value of {self.name} has shape {values.shape} where ({self.size},) is "
@@ -127,8 +96,7 @@ class _Rows:
 
     def jacobian(self, x: Array) -> Array:
         name, m, n = f"the Jacobian matrix of {self.name}", self.size, x.size
-        matrix = self._differences(x) if not callable(self.jac) else self.jac(x.copy(), *self.args)
-        matrix = _dense(name, matrix)
+        matrix = _dense(name, self.jac(x.copy()))
         # A vector is one row, or one column, where it cannot be anything else.
         if matrix.ndim < 2 and 1 in (m, n) and matrix.size == m * n:
             matrix = matrix.reshape(m, n)
@@ -139,28 +107,6 @@ class _Rows:
             i, j = (int(k) for k in np.argwhere(~np.isfinite(matrix))[0])
             raise MMAError(f"{name} is {matrix[i, j]} at [{i}, {j}]: {REJECT}")
         return np.vstack([-matrix[self.has_low], matrix[self.has_high]])
-
-    def _differences(self, x: Array) -> Array:
-        """By finite differences within the bounds; a fixed variable, which has no room, has 0."""
-        free = self.lower < self.upper
-
-        def function(part: Any) -> Any:
-            whole = x.astype(part.dtype)
-            whole[free] = part
-            # A copy: it may be a buffer.
-            return np.atleast_1d(np.array(self.fun(whole, *self.args)))
-
-        matrix = np.zeros((self.size, x.size))
-        if np.any(free) and self.size:
-            step = self.rel_step
-            matrix[:, free] = approx_derivative(
-                function,
-                x[free],
-                method=self.jac,
-                rel_step=step if step is None or np.ndim(step) == 0 else np.asarray(step)[free],
-                bounds=(self.lower[free], self.upper[free]),
-            )
-        return matrix
 
     def violated(self, row: int, amount: float) -> str:
         """Which limit the row is, and that it is violated by that amount."""
@@ -279,9 +225,8 @@ def minimize(
         ``jac(x, *args) -> ndarray, shape (n,)``, the gradient.
     bounds : scipy.optimize.Bounds or sequence of (lower, upper)
         All finite. No function is evaluated outside.
-    constraints : LinearConstraint, NonlinearConstraint, dict, or a list of these
-        In the conventions of scipy.optimize; inequalities only. Their Jacobian matrices are
-        found by finite differences where none is given.
+    constraints : LinearConstraint, NonlinearConstraint, or a list of these
+        In the conventions of scipy.optimize; inequalities only, with their Jacobian matrices.
     callback : callable, optional
         ``callback(x)`` or ``callback(intermediate_result=...)`` after each iteration, with
         copies. It stops the search by raising StopIteration.
@@ -346,15 +291,13 @@ def minimize(
     inside = np.clip(x, mma.lower, mma.upper)
     x = np.where(np.abs(x - inside) <= rounding, inside, x)
     mma.check_within("x0", x)
-    if isinstance(constraints, LinearConstraint | NonlinearConstraint | Mapping):
+    if isinstance(constraints, LinearConstraint | NonlinearConstraint):
         constraints = [constraints]
     try:
         constraints = [] if constraints is None else list(constraints)
     except TypeError:
         constraints = [constraints]  # refused by the next line
-    rows = [
-        _Rows(f"constraints[{k}]", c, x, mma.lower, mma.upper) for k, c in enumerate(constraints)
-    ]
+    rows = [_Rows(f"constraints[{k}]", c, x) for k, c in enumerate(constraints)]
     problem = _Problem(fun, jac, args if isinstance(args, tuple) else (args,), rows)
     by_name = callback is not None and _takes_result(callback)
 
