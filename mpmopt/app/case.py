@@ -6,7 +6,7 @@ import json
 import logging
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,7 @@ from mpmopt.optimisation.settings import Settings
 from mpmopt.results import runfile
 from mpmopt.scene import Scene
 from mpmopt.scene.particles import discretise
+from mpmopt.scene.scene import Formulation
 from mpmopt.simulation.checkpoints import Checkpointing
 from mpmopt.validation import digits, instance, place, shown
 
@@ -84,6 +85,22 @@ class Case:
         if isinstance(start["phi"], (str, os.PathLike)):
             start["phi"] = read_picture(start["phi"])
         object.__setattr__(self, "start", start)
+
+    def in_formulation(self, formulation: Formulation) -> Case:
+        """The case in another formulation, with floors that MLS-MPM bears."""
+        stages = self.settings.stages
+        if formulation == "updated":
+            stages = tuple(
+                replace(
+                    stage,
+                    void_density=max(stage.void_density, 1e-2),
+                    void_stiffness=max(stage.void_stiffness, 1e-3),
+                    void_cutoff=0.05 if stage.solid else stage.void_cutoff,
+                )
+                for stage in stages
+            )
+        scene = replace(self.scene, formulation=formulation)
+        return replace(self, scene=scene, settings=replace(self.settings, stages=stages))
 
 
 class ProgressBar:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from mpmopt.app.case import Case, run
 from mpmopt.app.ending import ending
+from mpmopt.errors import SceneError
 from mpmopt.io.console import how_to_go_on, reported
 
 
@@ -49,6 +50,11 @@ def main(description: str, cases: Mapping[str, Case], argv: list[str] | None = N
                 f"--{name}", dest="setting", action="store_const", const=name, help=text
             )
     parser.add_argument(
+        "--formulation",
+        choices=("updated", "total"),
+        help="simulate it so: updated is MLS-MPM, total is total Lagrangian",
+    )
+    parser.add_argument(
         "--starts", type=int, metavar="N", help="optimise from N starts, all but one random"
     )
     parser.add_argument(
@@ -58,6 +64,11 @@ def main(description: str, cases: Mapping[str, Case], argv: list[str] | None = N
     logging.basicConfig(format="%(message)s")
     setting = getattr(arguments, "setting", None) or "default"
     case = cases[setting]
+    if arguments.formulation:
+        try:
+            case = case.in_formulation(arguments.formulation)
+        except SceneError as error:
+            parser.error(f"--formulation {arguments.formulation}: {error}")
     out, force = arguments.out, arguments.force
     if arguments.starts is None:
         if arguments.scheduler:

@@ -35,25 +35,26 @@ def continuation(time_step: float) -> Settings:
 
 
 def gait(time_step: float, most_iterations: int) -> Settings:
-    """Beta doubled from 1 to 32 with long moves, for scenes in which distance is smooth.
+    """Beta doubled from 1 to 32 with plain moving asymptotes, where distance is smooth.
 
-    That is so with contact layers, finite friction and viscosity. At 16 and 32 designs count with
-    the least of their refinement study: wide cells close narrow gaps, which then bear the body.
+    That is so with contact layers, finite friction and viscosity, in the total Lagrangian
+    formulation, whose void may be light. From 8 on designs are judged solid too.
     """
     return Settings(
         tuple(
             Stage(
                 beta=2.0**k,
-                void_density=1e-2,
-                void_stiffness=1e-3,
+                void_density=2e-3,
+                void_stiffness=2e-4,
                 time_step=time_step,
                 solid=k >= 3,
-                refined=k >= 4,
                 move_limit=0.1,
-                void_cutoff=0.05 if k >= 3 else 0.0,
             )
             for k in range(6)
         ),
+        adapt_move_limit=False,
+        sharpen_asymptotes=False,
+        best_first=False,
         most_iterations=most_iterations,
     )
 
