@@ -111,7 +111,7 @@ def test_the_force_is_that_of_all_pairs(rng, corners, changes, per_cell):
     for _ in range(18):  # crumpled more and more: lists are kept, and made anew
         nodes[:2] += 0.15 * (8 * C - nodes[:2])
         nodes[:2] += 0.05 * C * rng.standard_normal((2, nodes.shape[1]))
-        near = pairs.renewed(near, nodes, touch)
+        near, _ = pairs.renewed(near, nodes, touch)
         force = np.zeros_like(nodes)
         pairs.push_apart(near, nodes, touch, force)
         expected = by_hand(simulation, nodes)
@@ -272,5 +272,5 @@ def test_void_pushes_nothing_and_solid_takes_no_notice_of_it():
     simulation = simulation_of(scene, stiffness)
     nodes, touch = simulation.start.copy(), simulation.lattice.touch
     nodes[0, nodes[0] > 6.5 * C] -= 6 * C
-    near = pairs.renewed(pairs.nowhere(touch), nodes, touch)
+    near, _ = pairs.renewed(pairs.nowhere(touch), nodes, touch)
     assert len(near.cells) == 0
