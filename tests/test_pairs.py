@@ -274,3 +274,24 @@ def test_void_pushes_nothing_and_solid_takes_no_notice_of_it():
     nodes[0, nodes[0] > 6.5 * C] -= 6 * C
     near, _ = pairs.renewed(pairs.nowhere(touch), nodes, touch)
     assert len(near.cells) == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("corners", "duration"), [(APART, 0.2), (FORK, 0.3)])
+def test_parts_that_meet_do_the_same_on_all_cells(corners, duration):
+    # At half the speed of waves they bounce; or bend, press each other and swing back.
+    speeds, places = [], []
+    for finer in (4, 8, 16):  # 64, 128 and 256 cells
+        steps = math.ceil(duration * finer / 2.7e-3)
+        grid = Grid((16 * finer, 16 * finer), C / finer)
+        scene = body(*corners, grid=grid, steps=steps, time_step=duration / steps)
+        simulation = simulation_of(scene, signal=np.zeros((steps, 1)))
+        closing(simulation, 3.0)
+        x, y = simulation.particles.position.T
+        left = (x < 6 * C) if corners is APART else (x < 5 * C) & (y > 8 * C)
+        states = simulation.run(np.linspace(0, steps, 7).astype(int))
+        speeds.append(states[-1, 2, left].mean())
+        places.append(states[:, 0, left].mean(axis=1))
+    assert max(speeds) < -1.0
+    assert np.ptp(speeds) <= 0.03 * abs(speeds[-1])
+    assert np.ptp(places, axis=0).max() <= 0.03 * np.ptp(places[-1])
