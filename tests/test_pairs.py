@@ -295,3 +295,33 @@ def test_parts_that_meet_do_the_same_on_all_cells(corners, duration):
     assert max(speeds) < -1.0
     assert np.ptp(speeds) <= 0.03 * abs(speeds[-1])
     assert np.ptp(places, axis=0).max() <= 0.03 * np.ptp(places[-1])
+
+
+@pytest.mark.parametrize(("per_cell", "lam"), [(2, 0.0), (2, 10.0), (3, 10.0), (4, 0.0)])
+def test_blocks_pressed_into_each_other_are_stable_at_the_largest_step(per_cell, lam):
+    material = Material(lame_lambda=lam)
+    scene = body(
+        ((3, 4), (4, 6)), ((9, 4), (10, 6)),
+        particles_per_cell=per_cell, material=material, time_step=1e-3,
+    )  # fmt: skip
+    step = scene.largest_time_step
+    count = len(discretise(scene).position)
+    simulation = simulation_of(scene, np.ones(count) + 0j, signal=np.zeros((40, 1)))
+    m = simulation.lattice.mass.real
+    there, right = np.nonzero(m > 0.0)[0], simulation.start[0].real > 6.5 * C
+    worst = 0.0
+    for gap in (0.45, 0.3, 0.15, 0.0, -0.3):  # between the next particles, in cells
+        pressed = simulation.start.copy()
+        pressed[0, right] -= (5.0 + 1.0 / per_cell - gap) * C
+        stiffness = []
+        for axis in (0, 1):
+            for k in there:
+                states = np.zeros((2, *pressed.shape), complex)
+                states[0] = pressed
+                states[0, axis, k] += 1e-30j
+                lagrangian.advance_lattice(states, 0, 1, simulation.lattice, simulation.signal)
+                stiffness.append(-(m * states[1, 2:].imag)[:, there].ravel() / 1e-33)
+        scale = np.tile(np.sqrt(m[there]), 2)
+        matrix = np.array(stiffness) / scale / scale[:, None]
+        worst = max(worst, np.linalg.eigvalsh(0.5 * (matrix + matrix.T)).max())
+    assert 0.7 < step * math.sqrt(worst) / 2.0 < 1.0
