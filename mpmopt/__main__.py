@@ -169,14 +169,14 @@ def study(path: Path) -> int:
     import numpy as np
 
     from mpmopt.app.study import full_study
-    from mpmopt.assess.refinement import VARIANTS, Variant
+    from mpmopt.assess.refinement import Variant, variants
     from mpmopt.assess.refinement import study as refined
     from mpmopt.assess.robustness import can_be_studied
     from mpmopt.io.progress import Progress
     from mpmopt.validation import digits
 
     run = _read(path).run
-    with Progress("simulations", VARIANTS) as progress:
+    with Progress("simulations", len(variants(run.scene))) as progress:
 
         def show(row: Variant) -> None:
             progress.step(row.name)

@@ -111,7 +111,7 @@ def test_the_force_is_that_of_all_pairs(rng, corners, changes, per_cell):
     for _ in range(18):  # crumpled more and more: lists are kept, and made anew
         nodes[:2] += 0.15 * (8 * C - nodes[:2])
         nodes[:2] += 0.05 * C * rng.standard_normal((2, nodes.shape[1]))
-        near = pairs.renewed(near, nodes, touch)
+        near, _ = pairs.renewed(near, nodes, touch)
         force = np.zeros_like(nodes)
         pairs.push_apart(near, nodes, touch, force)
         expected = by_hand(simulation, nodes)
@@ -272,5 +272,56 @@ def test_void_pushes_nothing_and_solid_takes_no_notice_of_it():
     simulation = simulation_of(scene, stiffness)
     nodes, touch = simulation.start.copy(), simulation.lattice.touch
     nodes[0, nodes[0] > 6.5 * C] -= 6 * C
-    near = pairs.renewed(pairs.nowhere(touch), nodes, touch)
+    near, _ = pairs.renewed(pairs.nowhere(touch), nodes, touch)
     assert len(near.cells) == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("corners", "duration"), [(APART, 0.2), (FORK, 0.3)])
+def test_parts_that_meet_do_the_same_on_all_cells(corners, duration):
+    # At half the speed of waves they bounce; or bend, press each other and swing back.
+    speeds, places = [], []
+    for finer in (4, 8, 16):  # 64, 128 and 256 cells
+        steps = math.ceil(duration * finer / 2.7e-3)
+        grid = Grid((16 * finer, 16 * finer), C / finer)
+        scene = body(*corners, grid=grid, steps=steps, time_step=duration / steps)
+        simulation = simulation_of(scene, signal=np.zeros((steps, 1)))
+        closing(simulation, 3.0)
+        x, y = simulation.particles.position.T
+        left = (x < 6 * C) if corners is APART else (x < 5 * C) & (y > 8 * C)
+        states = simulation.run(np.linspace(0, steps, 7).astype(int))
+        speeds.append(states[-1, 2, left].mean())
+        places.append(states[:, 0, left].mean(axis=1))
+    assert max(speeds) < -1.0
+    assert np.ptp(speeds) <= 0.03 * abs(speeds[-1])
+    assert np.ptp(places, axis=0).max() <= 0.03 * np.ptp(places[-1])
+
+
+@pytest.mark.parametrize(("per_cell", "lam"), [(2, 0.0), (2, 10.0), (3, 10.0), (4, 0.0)])
+def test_blocks_pressed_into_each_other_are_stable_at_the_largest_step(per_cell, lam):
+    material = Material(lame_lambda=lam)
+    scene = body(
+        ((3, 4), (4, 6)), ((9, 4), (10, 6)),
+        particles_per_cell=per_cell, material=material, time_step=1e-3,
+    )  # fmt: skip
+    step = scene.largest_time_step
+    count = len(discretise(scene).position)
+    simulation = simulation_of(scene, np.ones(count) + 0j, signal=np.zeros((40, 1)))
+    m = simulation.lattice.mass.real
+    there, right = np.nonzero(m > 0.0)[0], simulation.start[0].real > 6.5 * C
+    worst = 0.0
+    for gap in (0.45, 0.3, 0.15, 0.0, -0.3):  # between the next particles, in cells
+        pressed = simulation.start.copy()
+        pressed[0, right] -= (5.0 + 1.0 / per_cell - gap) * C
+        stiffness = []
+        for axis in (0, 1):
+            for k in there:
+                states = np.zeros((2, *pressed.shape), complex)
+                states[0] = pressed
+                states[0, axis, k] += 1e-30j
+                lagrangian.advance_lattice(states, 0, 1, simulation.lattice, simulation.signal)
+                stiffness.append(-(m * states[1, 2:].imag)[:, there].ravel() / 1e-33)
+        scale = np.tile(np.sqrt(m[there]), 2)
+        matrix = np.array(stiffness) / scale / scale[:, None]
+        worst = max(worst, np.linalg.eigvalsh(0.5 * (matrix + matrix.T)).max())
+    assert 0.7 < step * math.sqrt(worst) / 2.0 < 1.0

@@ -17,7 +17,7 @@ from mpmopt.design.variation import refined
 from mpmopt.errors import SceneError
 from mpmopt.optimisation.loop import optimise
 from mpmopt.results import runfile
-from mpmopt.scene import Actuator
+from mpmopt.scene import Actuator, Ground
 from mpmopt.scene.particles import discretise
 
 
@@ -43,6 +43,17 @@ def test_a_refinement_study_simulates_the_same_robot_with_other_steps_and_cells(
     for name, row in rows.items():
         assert row.retained == pytest.approx(gains[name] / gains["as designed"])
         assert 0.3 < row.retained < 1.6
+
+
+def test_on_ground_the_other_formulation_is_tried_too():
+    c = 1 / 16
+    scene = small_scene(walls=(), steps=10, ground=(Ground(((0.0, 4 * c), (1.0, 4 * c)), 0.4, c),))
+    for there in (scene, dataclasses.replace(scene, formulation="total")):
+        problem = Problem(there)
+        rows = study(problem, problem.join(0.5, 0.5, 0.2, 0.1))
+        assert rows[-1].name == "other formulation"
+        assert not rows[-1].failure
+        assert rows[-1].distance == pytest.approx(rows[0].distance, rel=0.3)
 
 
 def test_the_finer_robot_has_the_same_shape():

@@ -15,9 +15,8 @@ from mpmopt.design.variation import refined
 from mpmopt.errors import SceneError, SimulationError
 from mpmopt.scene import Scene
 from mpmopt.scene.particles import discretise, nearest_designed
+from mpmopt.scene.scene import Formulation
 from mpmopt.validation import instance
-
-VARIANTS = 4  # discretisations that `study` tries
 
 
 @dataclass(frozen=True)
@@ -75,6 +74,20 @@ def mapped(scene: Scene, problem: Problem, x: NDArray[np.float64]) -> NDArray[np
     return threshold.kept(problem, x)[nearest_designed(discretise(scene), problem.particles)]
 
 
+def variants(scene: Scene) -> dict[str, Callable[[], Scene]]:
+    """What makes the discretisations that `study` tries, by name."""
+    others: dict[str, Callable[[], Scene]] = {
+        "as designed": lambda: scene,
+        "half the step": lambda: scene.vary(time_step=scene.time_step / 2.0),
+        "twice the step": lambda: scene.vary(time_step=scene.time_step * 2.0),
+        "cells half as wide": lambda: refined(scene, 2),
+    }
+    if not scene.walls and not scene.clamps:  # which one of the formulations does not know
+        formulation: Formulation = "updated" if scene.formulation == "total" else "total"
+        others["other formulation"] = lambda: replace(scene, formulation=formulation)
+    return others
+
+
 def study(
     problem: Problem,
     x: NDArray[np.float64],
@@ -97,8 +110,9 @@ def study(
     Returns
     -------
     list of Variant
-        First as it was designed, then with half the step, twice the step, and cells half as wide.
-        What cannot be simulated says why.
+        First as it was designed, then with half the step, twice the step, cells half as wide, and
+        in the other formulation where the scene has neither walls nor clamps. What cannot be
+        simulated says why.
 
     Raises
     ------
@@ -108,14 +122,8 @@ def study(
     instance("study", "problem", problem, Problem)
     variables = problem.split(x)
     scene = problem.scene
-    variants: dict[str, Callable[[], Scene]] = {
-        "as designed": lambda: scene,
-        "half the step": lambda: scene.vary(time_step=scene.time_step / 2.0),
-        "twice the step": lambda: scene.vary(time_step=scene.time_step * 2.0),
-        "cells half as wide": lambda: refined(scene, 2),
-    }
     rows: list[Variant] = []
-    for name, make in variants.items():
+    for name, make in variants(scene).items():
         there = scene
         try:
             there = make()

@@ -703,7 +703,7 @@ def advance_lattice(
     """
     rows, force = make_rows(4, 3, lattice), np.zeros((3, len(lattice.mass)), states.dtype)
     near, per_mass = np.zeros(len(lattice.filled), np.bool_), steps_per_mass(lattice)
-    moved, touching = math.inf, nowhere(lattice.touch)
+    moved, touching, room = math.inf, nowhere(lattice.touch), -1.0
     for n in range(first, last):
         old, new = states[n % len(states)], states[(n + 1) % len(states)]
         force[:] = 0.0
@@ -713,7 +713,8 @@ def advance_lattice(
                 find_near(old, lattice, rows, near)
                 moved = 0.0
             press(old, lattice, near, rows, force)
-        touching = renewed(touching, old, lattice.touch)
+        if room < 0.0:
+            touching, room = renewed(touching, old, lattice.touch)
         if len(touching.pairs):
             push_apart(touching, old, lattice.touch, force)
         if lattice.mirror_axis >= 0:
@@ -722,6 +723,7 @@ def advance_lattice(
         if not speed < math.inf:
             return n, first_unsound(new)
         moved += lattice.dt * math.sqrt(speed)
+        room -= lattice.dt * math.sqrt(speed)
     return last, -1
 
 
@@ -752,7 +754,7 @@ def advance_lattice_adjoint(
     rows, force = make_rows(6, 4, lattice), np.zeros((3, len(lattice.mass)), states.dtype)
     force_bar = np.zeros_like(force)
     near, per_mass = np.zeros(len(lattice.filled), np.bool_), steps_per_mass(lattice)
-    moved, touching = math.inf, nowhere(lattice.touch)
+    moved, touching, room = math.inf, nowhere(lattice.touch), -1.0
     for n in range(last - 1, first - 1, -1):
         old, new = states[n], states[n + 1]
         if len(lattice.ground.layers):
@@ -764,13 +766,16 @@ def advance_lattice_adjoint(
             press(old, lattice, near, rows, force)
             if lattice.mirror_axis >= 0:
                 fold(force, lattice)
-            moved += lattice.dt * fastest_of(old)
         move_adjoint(old, new, force, per_mass, lattice, state_bar, force_bar, bar)
         if lattice.mirror_axis >= 0:
             fold(force_bar, lattice)
-        touching = renewed(touching, old, lattice.touch)
+        if room < 0.0:
+            touching, room = renewed(touching, old, lattice.touch)
         if len(touching.pairs):
             push_apart_adjoint(touching, old, lattice.touch, force_bar, state_bar, bar.grip)
+        step = lattice.dt * fastest_of(old)
+        moved += step
+        room -= step
         forces_adjoint(old, force_bar, lattice, signal[n], rows, state_bar, bar, signal_bar[n])
         if len(lattice.ground.layers):
             press_adjoint(old, force_bar, lattice, near, rows, state_bar, bar)

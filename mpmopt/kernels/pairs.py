@@ -99,13 +99,15 @@ def flipped(x, y, touch):
 
 
 @jit
-def moved(nodes, at, touch, limit):
-    """Whether a node of what may touch is farther than `limit` from where it was."""
-    far = 0
+def strayed(nodes, at, touch):
+    """How far the farthest node of what may touch is from where it was."""
+    most = 0.0
     for i in range(at.shape[1]):
         dx, dy = nodes[0, i].real - at[0, i], nodes[1, i].real - at[1, i]
-        far += touch.nodes[i] * (dx * dx + dy * dy) > limit * limit
-    return far > 0
+        square = touch.nodes[i] * (dx * dx + dy * dy)
+        if square > most:
+            most = square
+    return math.sqrt(most)
 
 
 @loop_jit
@@ -130,13 +132,13 @@ def look_for_cells(nodes, touch):
     near may be apart. Pairs are in ascending order.
     """
     count, reach, own = len(touch.grip), (REACH + WIDE_SKIN) * touch.dx, len(touch.blocks)
-    of_cells = boxes_of_cells(nodes, touch)
-    boxes, which, units = boxes_of_blocks(of_cells, touch, reach)
+    cells = boxes_of_cells(nodes, touch)
+    blocks, which, units = boxes_of_blocks(cells, touch, reach)
     low_x = low_y = math.inf
     high_x = high_y = -math.inf
     width = 0.0
     for n in range(units):
-        x0, y0, x1, y1 = boxes[n, 0], boxes[n, 1], boxes[n, 2], boxes[n, 3]
+        x0, y0, x1, y1 = blocks[n, 0], blocks[n, 1], blocks[n, 2], blocks[n, 3]
         low_x, high_x = min(low_x, x0), max(high_x, x1)
         low_y, high_y = min(low_y, y0), max(high_y, y1)
         width = max(width, x1 - x0, y1 - y0)
@@ -148,19 +150,19 @@ def look_for_cells(nodes, touch):
     per_y = 1.0 / max(width, (high_y - low_y) / rows)
     newest, older = np.full(columns * rows, -1), np.empty(units, np.int64)
     found, total = np.empty(64, np.int64), 0
+    rim = 1.0 - 1.0 / touch.per_cell
     for n in range(units - 1, -1, -1):  # images first, so that own blocks meet all of them
-        i = int((0.5 * (boxes[n, 0] + boxes[n, 2]) - low_x) * per_x)
-        j = int((0.5 * (boxes[n, 1] + boxes[n, 3]) - low_y) * per_y)
+        i = int((0.5 * (blocks[n, 0] + blocks[n, 2]) - low_x) * per_x)
+        j = int((0.5 * (blocks[n, 1] + blocks[n, 3]) - low_y) * per_y)
         i, j = min(i, columns - 1), min(j, rows - 1)
         for a in range(max(i - 1, 0), min(i + 2, columns)):
             for b in range(max(j - 1, 0), min(j + 2, rows)):
                 m = newest[a * rows + b]
                 while m >= 0 and n < own:
-                    far = are_far(touch.block_corner, which[n], which[m], SIDE - 1, touch)
-                    if far and are_near(boxes, n, boxes, m, reach):
-                        while total + 16 > len(found):
+                    if are_far_and_near(blocks, n, m, rim + SIDE - 1, reach):
+                        while total + SIDE**4 > len(found):
                             found = np.concatenate((found, found))
-                        total = add_cells(found, total, which[n], which[m], of_cells, touch, reach)
+                        total = add_cells(found, total, which[n], which[m], cells, touch, reach)
                     m = older[m]
         older[n] = newest[i * rows + j]
         newest[i * rows + j] = n
@@ -173,7 +175,10 @@ def look_for_cells(nodes, touch):
 
 @loop_jit
 def boxes_of_cells(nodes, touch):
-    """Boxes (2 C, 4) about the particles of all cells and images: x0, y0, x1, y1."""
+    """Boxes (2 C, 6) about the particles of cells and images, and their places on the lattice.
+
+    Numbers are x0, y0, x1, y1 in the state, and i, j in the reference configuration.
+    """
     count, M, step = len(touch.grip), nodes.shape[1], touch.offset[1]
     last = M - touch.offset[8]
     sums, ends = np.empty(M), np.empty((4, M))
@@ -190,84 +195,85 @@ def boxes_of_cells(nodes, touch):
                     x = w0 * sums[i] + w1 * sums[i + 1] + w2 * sums[i + 2]
                     low[i] = x if x < low[i] else low[i]
                     high[i] = x if x > high[i] else high[i]
-    boxes = np.empty((2 * count, 4))
-    for c in touch.cells:
-        i = touch.first[c]
+    boxes = np.empty((2 * count, 6))
+    for n in range(len(touch.cells)):
+        c = touch.cells[n]
         for k in range(4):
-            boxes[c, k] = ends[k, i]
+            boxes[c, k] = ends[k, touch.first[c]]
+        boxes[c, 4], boxes[c, 5] = touch.corner[c, 0], touch.corner[c, 1]
         if touch.axis >= 0:
-            image_box(boxes, c, boxes, count + c, touch)
+            add_image(boxes, c, count + c, touch)
+            boxes[count + c, 4] = touch.corner[count + c, 0]
+            boxes[count + c, 5] = touch.corner[count + c, 1]
     return boxes
 
 
 @jit
-def image_box(boxes, n, images, m, touch):
-    """Writes the box of an image."""
+def add_image(boxes, n, m, touch):
+    """Makes box m that of the image of box n."""
     x0, y0 = imaged(boxes[n, 0], boxes[n, 1], touch)
     x1, y1 = imaged(boxes[n, 2], boxes[n, 3], touch)
-    images[m, 0], images[m, 2] = min(x0, x1), max(x0, x1)
-    images[m, 1], images[m, 3] = min(y0, y1), max(y0, y1)
+    boxes[m, 0], boxes[m, 2] = min(x0, x1), max(x0, x1)
+    boxes[m, 1], boxes[m, 3] = min(y0, y1), max(y0, y1)
 
 
 @loop_jit
-def boxes_of_blocks(of_cells, touch, reach):
-    """Boxes of blocks and of those images that may be near to any; which they are; their number."""
+def boxes_of_blocks(cells, touch, reach):
+    """The same of blocks, and of those images that may be near to any; which, and their number."""
     own = len(touch.blocks)
-    boxes, which, units = np.empty((2 * own, 4)), np.empty(2 * own, np.int64), own
+    boxes, which, units = np.empty((2 * own, 6)), np.empty(2 * own, np.int64), own
     high = -math.inf
     for n in range(own):
         x0 = y0 = math.inf
         x1 = y1 = -math.inf
-        for c in touch.blocks[n]:
+        for k in range(SIDE * SIDE):
+            c = touch.blocks[n, k]
             if c >= 0:
-                x0, y0 = min(x0, of_cells[c, 0]), min(y0, of_cells[c, 1])
-                x1, y1 = max(x1, of_cells[c, 2]), max(y1, of_cells[c, 3])
+                x0, y0 = min(x0, cells[c, 0]), min(y0, cells[c, 1])
+                x1, y1 = max(x1, cells[c, 2]), max(y1, cells[c, 3])
         boxes[n, 0], boxes[n, 1], boxes[n, 2], boxes[n, 3] = x0, y0, x1, y1
-        which[n] = n
         high = max(high, x1 if touch.axis == 0 else y1)
+        which[n] = n
     if touch.axis >= 0:
         for n in range(own):
             if boxes[n, 2 + touch.axis] + high + reach > 2.0 * touch.plane:
-                image_box(boxes, n, boxes, units, touch)
+                add_image(boxes, n, units, touch)
                 which[units] = own + n
                 units += 1
+    for n in range(units):
+        boxes[n, 4] = touch.block_corner[which[n], 0]
+        boxes[n, 5] = touch.block_corner[which[n], 1]
     return boxes, which, units
 
 
 @jit
-def are_near(boxes, n, others, m, reach):
-    """Whether two boxes are nearer than `reach`."""
-    x = max(others[m, 0] - boxes[n, 2], boxes[n, 0] - others[m, 2], 0.0)
-    y = max(others[m, 1] - boxes[n, 3], boxes[n, 1] - others[m, 3], 0.0)
-    return x * x + y * y < reach * reach
+def are_far_and_near(boxes, n, m, rim, reach):
+    """Whether two boxes are nearer than `reach`, and were farther apart than what is one part.
+
+    `rim` is the width of a box in the reference configuration, in cells.
+    """
+    i, j = abs(boxes[m, 4] - boxes[n, 4]) + rim, abs(boxes[m, 5] - boxes[n, 5]) + rim
+    x = max(boxes[m, 0] - boxes[n, 2], boxes[n, 0] - boxes[m, 2], 0.0)
+    y = max(boxes[m, 1] - boxes[n, 3], boxes[n, 1] - boxes[m, 3], 0.0)
+    return i * i + j * j > FAR * FAR and x * x + y * y < reach * reach
 
 
 @jit
 def add_cells(found, total, n, m, boxes, touch, reach):
     """Adds keys of near cells of block n and of block or image m; returns how many there are."""
     count, own = len(touch.grip), len(touch.blocks)
-    shift = count if m >= own else 0
-    for c in touch.blocks[n]:
-        for d in touch.blocks[m % own]:
+    other, shift = (m - own, count) if m >= own else (m, 0)
+    rim = 1.0 - 1.0 / touch.per_cell
+    for i in range(SIDE * SIDE):
+        c = touch.blocks[n, i]
+        for j in range(SIDE * SIDE):
+            d = touch.blocks[other, j]
             # A cell and another's image are the other and this one's image: one of them counts.
-            if c >= 0 and d >= 0 and (d >= c or shift == 0):
-                far = are_far(touch.corner, c, d + shift, 0, touch)
-                if far and are_near(boxes, c, boxes, d + shift, reach):
-                    found[total] = min(c, d) * 2 * count + max(c, d) + shift
-                    total += 1
+            counts = c >= 0 and d >= 0 and (d >= c or shift == 0)
+            if counts and are_far_and_near(boxes, c, d + shift, rim, reach):
+                found[total] = min(c, d) * 2 * count + max(c, d) + shift
+                total += 1
     return total
-
-
-@jit
-def are_far(corner, a, b, more, touch):
-    """Whether particles of two cells were farther apart than what is one part; or of two blocks.
-
-    Blocks have `more` cells along each axis than one, and `corner` is that of the first.
-    """
-    rim = more + 1.0 - 1.0 / touch.per_cell
-    i = abs(corner[a, 0] - corner[b, 0]) + rim
-    j = abs(corner[a, 1] - corner[b, 1]) + rim
-    return i * i + j * j > FAR * FAR
 
 
 @loop_jit
@@ -323,19 +329,27 @@ def places(nodes):
 
 
 @loop_jit
-def renewed(near: Any, nodes: NDArray, touch: Any) -> Near:
-    """The lists for nodes (., M), of which the first two rows are x and y: anew if they moved."""
-    if moved(nodes, near.cells_at, touch, HALF * WIDE_SKIN * touch.dx):
-        at, old = places(nodes), nowhere(touch)
+def renewed(near: Any, nodes: NDArray, touch: Any) -> tuple[Near, float]:
+    """The lists for nodes (., M), of which the first two rows are x and y: anew if they moved.
+
+    And by how much all nodes may move before they have to be asked for again.
+    """
+    moved, may = strayed(nodes, near.cells_at, touch), HALF * WIDE_SKIN * touch.dx
+    if moved > may:
+        at, old, moved = places(nodes), nowhere(touch), 0.0
         cells = look_for_cells(at, touch)
         if len(cells) == 0:
             touch.alone[:] = at
         near = Near(at, cells, old.at, old.pairs, old.members, old.room)
-    if len(near.cells) > 0 and moved(nodes, near.at, touch, HALF * near.room):
-        at = places(nodes)
-        pairs, members, room = look_for_particles(at, touch, near.cells)
-        near = Near(near.cells_at, near.cells, at, pairs, members, room)
-    return near
+    room = may - moved
+    if len(near.cells) > 0:
+        moved = strayed(nodes, near.at, touch)
+        if moved > HALF * near.room:
+            at, moved = places(nodes), 0.0
+            pairs, members, free = look_for_particles(at, touch, near.cells)
+            near = Near(near.cells_at, near.cells, at, pairs, members, free)
+        room = min(room, HALF * near.room - moved)
+    return near, room
 
 
 @loop_jit

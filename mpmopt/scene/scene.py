@@ -235,7 +235,7 @@ class Scene(Checked):
         """Stability limit of an isolated particle (`Material.largest_time_step`).
 
         A particle in the total Lagrangian formulation bears 0.9 of it: `LAGRANGIAN_LIMIT` counts.
-        So do parts that touch, whose pairs of particles have omega^2 up to 6 + 0.55 n^2 times
+        So do parts that touch, whose pairs of particles have omega^2 up to 5.5 + 0.65 n^2 times
         (c_p / dx)^2 with n particles per cell and direction (measured, with the material's own).
         """
         return min(self.largest_time_step_of(material) for material in self.materials)
@@ -247,7 +247,7 @@ class Scene(Checked):
         if self.formulation == "updated":
             return material.largest_time_step(dx, layer)
         # dt = 2 / omega, after the factor below.
-        rate = 6.0 + 0.55 * self.particles_per_cell**2
+        rate = 5.5 + 0.65 * self.particles_per_cell**2
         touching = 0.25 * rate * LAGRANGIAN_LIMIT**2 * material.density * material.wave_speed**2
         return LAGRANGIAN_LIMIT * material.largest_time_step(dx, layer, touching)
 
