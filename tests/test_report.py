@@ -133,6 +133,14 @@ def test_a_designs_picture_has_a_pixel_for_each_particle():
     assert problem.gamma(problem.join(0.0, 0.0, 0.0, 0.0)).size == gamma.size
 
 
+def test_each_evaluation_is_shown_with_its_design(page, short_run):
+    pictures = data_of(page)["history"]["pictures"]
+    assert len(set(pictures)) == len(pictures) == 2
+    last = short_run.designs[1]
+    assert last == pytest.approx(255.0 * short_run.last.gamma, abs=0.5)
+    assert pictures[1] == design_picture(short_run.scene, last / 255.0)
+
+
 def test_a_body_that_cannot_be_simulated_is_left_out(
     short_run, short_path, tmp_path, caplog, monkeypatch
 ):
@@ -237,6 +245,7 @@ def test_the_page_works_in_a_real_browser(page, tmp_path):
         look = browser.js("document.querySelector('#look').textContent")
         assert look.startswith("Evaluation 2 of 2, the chosen one")
         assert browser.js("document.querySelector('#look img').naturalWidth") == 8
+        assert browser.js("past.pictures.length") == 2
         text = browser.js("document.body.innerText")
         for name in ("speed by friction", "thinnest member", "pieces", SUMMARY["odd"]):
             assert name in text

@@ -231,6 +231,7 @@ def _history(run: Optimisation) -> dict[str, Any]:
     for name in ("objective", "post_processed", "refined"):
         columns[name] = [value - zero for value in columns[name]]
     columns["scenes"] = [[value - zero for value in values] for values in columns["scenes"]]
+    columns["pictures"] = [design_picture(run.scene, design / 255.0) for design in run.designs]
     columns["unit"], columns["chosen"] = run.measure, run.chosen
     return columns
 
