@@ -245,10 +245,11 @@ class Optimisation:
     @property
     def origin(self) -> float:
         """The objective of a body that stays put, if it is a displacement; else 0."""
-        if not isinstance(self.task.maximise, Displacement):
+        term = self.task.maximise
+        if not isinstance(term, Displacement):
             return 0.0
         particles = discretise(self.scene)
-        return Objective.of(self.scene, particles, self.task.maximise.direction).start
+        return Objective.of(self.scene, particles, term.direction, term.region).start
 
     def __repr__(self) -> str:
         found, stages = "no design yet", self.settings.stages

@@ -284,6 +284,9 @@ PLACED = {
 }
 
 
+ACTUATION = "a", "theta", "b", "angular_frequency"
+
+
 def _tables(
     run: Optimisation, summary: Mapping[str, Any], versions: Mapping[str, str]
 ) -> dict[str, Any]:
@@ -301,7 +304,7 @@ def _tables(
         for name, value in rest.pop("gain", {}).items()
     }
     rest.pop("retained_gain", None)
-    others = {name: rest.pop(name) for name in ("a", "theta", "b") if name in rest}
+    others = {name: rest.pop(name) for name in ACTUATION if name in rest}
     rows = zip(run.task.subject_to, result.constraints, result.multipliers)
     return {
         "travel": travel,
