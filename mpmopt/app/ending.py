@@ -92,7 +92,7 @@ def _elsewhere(summary: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _pieces(summary: Mapping[str, Any]) -> str:
-    loose, count = summary["disconnected_particles"], summary["components"]
+    loose, count = summary["disconnected_particles"], summary.get("components", 1)
     return f"{count}, {loose} particles hang on nothing" if loose else f"{count}, nothing is loose"
 
 
