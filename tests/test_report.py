@@ -3,8 +3,11 @@
 import base64
 import dataclasses
 import json
+import os
+import subprocess
 import zlib
 from io import BytesIO
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,7 +20,7 @@ from mpmopt.__main__ import main
 from mpmopt.assess.trajectory import Motion, optimised, post_processed
 from mpmopt.design.problem import Problem
 from mpmopt.design.task import AtMost, Task
-from mpmopt.design.terms import Effort, Volume
+from mpmopt.design.terms import Displacement, Effort, Volume
 from mpmopt.design.variation import Variation
 from mpmopt.errors import DesignError, SimulationError
 from mpmopt.results import runfile
@@ -26,6 +29,7 @@ from mpmopt.view import report as reporting
 from mpmopt.view.draw import view
 from mpmopt.view.report import design_picture, packed, report
 
+ROOT = Path(__file__).parent.parent
 SUMMARY = {
     "start": 0.32, "reference": 0.31, "optimised": 0.5, "post_processed": 0.4,
     "gain": {"as designed": 0.09, "half the step": None},
@@ -73,6 +77,16 @@ def test_displacements_count_from_where_the_body_was(page, short_run):
     wanted = [item.objective - start for item in short_run.history]
     assert data["history"]["objective"] == pytest.approx(wanted, rel=1e-4)
     assert data["tables"]["retained"]["half the step"] == {"gain": None, "retained": None}
+
+
+def test_a_body_that_stays_has_gone_nowhere_whatever_counts(short_run):
+    still = dataclasses.replace(short_run.scene, gravity=(0.0, 0.0), walls=())
+    problem = Problem(still)
+    x = problem.join(1.0, 0.0, 0.0, 0.0)
+    for term in (Displacement(), Displacement((0.0, 1.0)), Displacement(region=1), Effort()):
+        run = dataclasses.replace(short_run, scene=still, task=Task(term))
+        assert run.origin == pytest.approx(Problem(still, task=run.task).value(x), abs=1e-12)
+        assert run.measure == ("objective" if term == Effort() else "displacement")
 
 
 def test_the_chosen_evaluation_is_the_results(page, short_run):
@@ -133,6 +147,14 @@ def test_a_designs_picture_has_a_pixel_for_each_particle():
     assert problem.gamma(problem.join(0.0, 0.0, 0.0, 0.0)).size == gamma.size
 
 
+def test_each_evaluation_is_shown_with_its_design(page, short_run):
+    pictures = data_of(page)["history"]["pictures"]
+    assert len(set(pictures)) == len(pictures) == 2
+    last = short_run.designs[1]
+    assert last == pytest.approx(255.0 * short_run.last.gamma, abs=0.5)
+    assert pictures[1] == design_picture(short_run.scene, last / 255.0)
+
+
 def test_a_body_that_cannot_be_simulated_is_left_out(
     short_run, short_path, tmp_path, caplog, monkeypatch
 ):
@@ -190,6 +212,18 @@ def test_the_command_writes_the_page(short_path, tmp_path, capsys):
     assert all(str(short_path) in line for line in data["commands"].values())
 
 
+@pytest.mark.process
+def test_the_line_that_reproduces_a_run_gives_its_digits(page):
+    line = next(iter(data_of(page)["commands"].values()))
+    done = subprocess.run(
+        line, shell=True, capture_output=True, text=True, timeout=120,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    again, objective = done.stdout.split()
+    assert again == objective
+
+
 SLIDER = "Number(document.querySelector('#slider').value)"
 CANVAS = "canvas.toDataURL()"  # what it shows
 
@@ -237,6 +271,7 @@ def test_the_page_works_in_a_real_browser(page, tmp_path):
         look = browser.js("document.querySelector('#look').textContent")
         assert look.startswith("Evaluation 2 of 2, the chosen one")
         assert browser.js("document.querySelector('#look img').naturalWidth") == 8
+        assert browser.js("past.pictures.length") == 2
         text = browser.js("document.body.innerText")
         for name in ("speed by friction", "thinnest member", "pieces", SUMMARY["odd"]):
             assert name in text

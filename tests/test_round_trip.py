@@ -91,6 +91,7 @@ def run():
         gave_up=True,
         best={1: distinct(Candidate, stage=1)},
         history=[distinct(Iteration) for _ in range(3)],
+        designs=[np.array([k, 255], np.uint8) for k in range(3)],
         first=distinct(Candidate),
         last=distinct(Candidate),
         stage_state=state,

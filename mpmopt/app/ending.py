@@ -64,7 +64,9 @@ def _travel(run: Optimisation, summary: Mapping[str, Any]) -> str:
     text = f"{_shown(solid)} without grey, {_shown(grey - run.origin)} as optimised"
     if run.measure == "displacement":
         time = run.scene.duration - run.scene.transient
-        text += f"; in {_shown(time)}, a speed of {_shown(solid / time)}"
+        text += f"; in {_shown(time)}"
+        if "speed" not in summary:
+            text += f", a speed of {_shown(solid / time)}"
     return text
 
 
@@ -85,11 +87,12 @@ def _elsewhere(summary: Mapping[str, Any]) -> dict[str, str]:
     by_friction = ", ".join(f"{_shown(speed)} at {friction}" for friction, speed in table)
     driven = summary["driven_share"]
     share = "" if driven is None else f"; {driven:.0%} of the speed is driven"
-    return {"speed": f"{_shown(summary['speed'])}{share}; by friction: {by_friction}"}
+    speed = f"{_shown(summary['speed'])} once it goes steadily{share}"
+    return {"speed": f"{speed}; by friction: {by_friction}"}
 
 
 def _pieces(summary: Mapping[str, Any]) -> str:
-    loose, count = summary["disconnected_particles"], summary["components"]
+    loose, count = summary["disconnected_particles"], summary.get("components", 1)
     return f"{count}, {loose} particles hang on nothing" if loose else f"{count}, nothing is loose"
 
 

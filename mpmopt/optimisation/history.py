@@ -174,6 +174,8 @@ class Optimisation:
         The best evaluation of each stage that had one.
     history : list of Iteration
         All evaluations.
+    designs : list of (D,) arrays of bytes
+        Their designs, for pictures: 255 gamma, rounded.
     first, last : Candidate or None
         The first and the last evaluation.
     stage_state : StageState or None
@@ -191,6 +193,7 @@ class Optimisation:
     gave_up: bool = False
     best: dict[int, Candidate] = field(default_factory=dict)
     history: list[Iteration] = field(default_factory=list)
+    designs: list[NDArray[np.uint8]] = field(default_factory=list)
     first: Candidate | None = None
     last: Candidate | None = None
     stage_state: StageState | None = None
@@ -242,10 +245,11 @@ class Optimisation:
     @property
     def origin(self) -> float:
         """The objective of a body that stays put, if it is a displacement; else 0."""
-        if not isinstance(self.task.maximise, Displacement):
+        term = self.task.maximise
+        if not isinstance(term, Displacement):
             return 0.0
         particles = discretise(self.scene)
-        return Objective.of(self.scene, particles, self.task.maximise.direction).start
+        return Objective.of(self.scene, particles, term.direction, term.region).start
 
     def __repr__(self) -> str:
         found, stages = "no design yet", self.settings.stages

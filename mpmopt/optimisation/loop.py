@@ -404,6 +404,7 @@ class _Ascent:
         run.first = run.first or candidate
         run.last = candidate
         run.history.append(Iteration(**candidate.numbers()))
+        run.designs.append(np.rint(255.0 * candidate.gamma).astype(np.uint8))
         if candidate.failure:
             self.failures += 1
             self.gradients = np.empty((0, 0))

@@ -6,6 +6,7 @@ Layout (version 6)::
                      settings, task, versions, summary
     x                the design that the stage began with
     history/NAME     one entry per evaluation: objective, beta, non_discreteness, step, ...
+    designs          one row per evaluation: 255 gamma, rounded, for pictures; may be missing
     best/            the best of all, with gamma, phi, a, theta, b, omega; attribute stage
     stages/K/        the best design of stage K: x, gamma; attributes of its evaluation
     first/, last/    the first and the last evaluation, in the same way
@@ -132,6 +133,8 @@ def _fill(file: h5py.File, run: Optimisation) -> None:
     file.create_dataset(
         "history/failure", data=[i.failure for i in run.history], dtype=h5py.string_dtype()
     )
+    if run.designs and len(run.designs) == len(run.history):  # a run that was begun before has none
+        file.create_dataset("designs", data=np.array(run.designs), dtype="u1")
     for name in ("first", "last"):
         _write_candidate(file, name, getattr(run, name))
     if run.stage_state is not None:
@@ -218,6 +221,7 @@ def _read(file: h5py.File, path: Path) -> RunFile:
         gave_up=bool(file.attrs["gave_up"]),
         best=_read_best(file.get("stages", {}), len(settings.stages)),
         history=_read_history(file["history"], task),
+        designs=_read_designs(file["designs"]) if "designs" in file else [],
         first=_read_candidate(file, "first"),
         last=_read_candidate(file, "last"),
         stage_state=_read_stage(file["stage"]) if "stage" in file else None,
@@ -257,6 +261,12 @@ def _read_history(group: h5py.Group, task: Task) -> list[Iteration]:
     if len({len(column) for column in columns.values()}) != 1:
         raise ValueError("the history's columns have different lengths")
     return [Iteration(**dict(zip(columns, row))) for row in zip(*columns.values())]
+
+
+def _read_designs(dataset: h5py.Dataset) -> list[NDArray[np.uint8]]:
+    if not isinstance(dataset, h5py.Dataset) or dataset.dtype != np.uint8 or dataset.ndim != 2:
+        raise ValueError("designs has not two axes of bytes")
+    return list(dataset[:])
 
 
 def _read_best(group: h5py.Group, stages: int) -> dict[int, Candidate]:

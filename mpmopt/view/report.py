@@ -231,6 +231,7 @@ def _history(run: Optimisation) -> dict[str, Any]:
     for name in ("objective", "post_processed", "refined"):
         columns[name] = [value - zero for value in columns[name]]
     columns["scenes"] = [[value - zero for value in values] for values in columns["scenes"]]
+    columns["pictures"] = [design_picture(run.scene, design / 255.0) for design in run.designs]
     columns["unit"], columns["chosen"] = run.measure, run.chosen
     return columns
 
@@ -283,6 +284,9 @@ PLACED = {
 }
 
 
+ACTUATION = "a", "theta", "b", "angular_frequency"
+
+
 def _tables(
     run: Optimisation, summary: Mapping[str, Any], versions: Mapping[str, str]
 ) -> dict[str, Any]:
@@ -300,7 +304,7 @@ def _tables(
         for name, value in rest.pop("gain", {}).items()
     }
     rest.pop("retained_gain", None)
-    others = {name: rest.pop(name) for name in ("a", "theta", "b") if name in rest}
+    others = {name: rest.pop(name) for name in ACTUATION if name in rest}
     rows = zip(run.task.subject_to, result.constraints, result.multipliers)
     return {
         "travel": travel,
