@@ -142,6 +142,13 @@ def test_scenes_are_what_their_names_say():
     assert strong[0].stress == ((2.4, 0.6), (0.6, 1.2))
     assert [each.angular_frequency for each in strong] == [24.0, 40.0]
     assert robot_in(scene).period(scene) == pytest.approx(2 * np.pi / 30.0)
+    tuned = tuple(
+        dataclasses.replace(region, detuning=0.5) if isinstance(region, Actuator) else region
+        for region in scene.body
+    )
+    problem = Problem(dataclasses.replace(scene, body=tuned))
+    slower = Robot.of(problem, problem.join(1.0, 0.5, 0.0, 0.0, (-1.0, 0.0)))
+    assert slower.period(problem.scene) == pytest.approx(2 * np.pi / 15.0)
     with pytest.raises(SceneError, match="no whole number"):
         refined(on_ground(grid=Grid((17, 16), C)), 0.5)
     assert not can_be_studied(small_scene())

@@ -20,10 +20,13 @@ from mpmopt.assess.threshold import (
     unactuated,
 )
 from mpmopt.assess.trajectory import post_processed as without_grey
+from mpmopt.assess.width import thinnest_member
 from mpmopt.design.actuation import frequencies
+from mpmopt.design.problem import Problem
 from mpmopt.design.variables import Variables
-from mpmopt.errors import SimulationError
+from mpmopt.errors import MissingLibraryError, SimulationError
 from mpmopt.optimisation.history import Optimisation
+from mpmopt.results.outline import outline
 from mpmopt.validation import digits, instance
 
 logger = logging.getLogger(__name__)
@@ -87,6 +90,7 @@ def summarise(
         },
         "retained_gain": {row.name: _number_or_none(row.retained) for row in others},
         **robustness.study(problem, best.x, full),
+        "thinnest_member": _thinnest_member(problem, best.x),
         **_constraints(result),
         "non_discreteness": best.non_discreteness,
         "a": numbers(actuation.a),
@@ -99,6 +103,17 @@ def summarise(
         "seconds": result.history[-1].seconds,
         "stop_reason": result.stop_reason,
     }
+
+
+def _thinnest_member(problem: Problem, x: NDArray[np.float64]) -> float | None:
+    """Width of the finished robot's thinnest member; None without manifold3d."""
+    keep = robustness.Robot.of(problem, x).keep
+    detail = problem.scene.grid.dx / problem.scene.particles_per_cell
+    rings = [ring for piece in outline(problem, x, keep=keep) for ring in piece.rings]
+    try:
+        return _number_or_none(thinnest_member(rings, detail))
+    except MissingLibraryError:
+        return None
 
 
 def _chosen(result: Optimisation, actuation: Variables) -> dict[str, Any]:

@@ -17,6 +17,7 @@ from scipy.ndimage import label
 
 from mpmopt.assess import threshold
 from mpmopt.assess.threshold import SOLID_LIMITS, solid_body
+from mpmopt.design.actuation import frequencies
 from mpmopt.design.ensemble import side_by_side
 from mpmopt.design.objective import Objective
 from mpmopt.design.problem import Problem
@@ -94,7 +95,7 @@ class Robot:
 
     def period(self, scene: Scene) -> float:
         """Of the slowest actuator in a scene."""
-        return 2.0 * math.pi / min(each.angular_frequency for each in scene.actuators)
+        return 2.0 * math.pi / float(np.min(frequencies(scene, self.variables.omega)))
 
 
 def _corner(scene: Scene) -> NDArray[np.float64]:
