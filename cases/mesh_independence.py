@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 from stability import gradients
 from walker import slanted_legs, walker
 
-from mpmopt.app.case import START
 from mpmopt.app.sweeps import as_csv
 from mpmopt.assess.threshold import solid_body
-from mpmopt.design.problem import Problem, Variables
+from mpmopt.design.problem import Problem
+from mpmopt.design.variables import START, Variables
 from mpmopt.errors import SimulationError
 from mpmopt.io.files import replace_file
 from mpmopt.scene import Ground, Scene, Wall

@@ -21,13 +21,13 @@ import numpy as np
 import walker
 from numpy.typing import NDArray
 
-from mpmopt.app.case import START
 from mpmopt.assess.refinement import mapped
 from mpmopt.assess.threshold import Baseline, distance, post_processed
 from mpmopt.design.actuation import signal
 from mpmopt.design.chain import interpolate
 from mpmopt.design.objective import Objective
-from mpmopt.design.problem import Problem, Variables
+from mpmopt.design.problem import Problem
+from mpmopt.design.variables import START, Variables
 from mpmopt.design.variation import refined
 from mpmopt.errors import MpmoptError, SimulationError
 from mpmopt.optimisation.loop import Optimisation, optimise

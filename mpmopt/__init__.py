@@ -22,6 +22,9 @@ _HOMES = {
     "Problem": "mpmopt.design.problem",
     "Task": "mpmopt.design.task",
     "AtMost": "mpmopt.design.task",
+    "Frozen": "mpmopt.design.variables",
+    "Bounded": "mpmopt.design.variables",
+    "Tied": "mpmopt.design.variables",
     "Displacement": "mpmopt.design.terms",
     "Speed": "mpmopt.design.terms",
     "Height": "mpmopt.design.places",
@@ -56,6 +59,9 @@ if TYPE_CHECKING:
     from mpmopt.design.terms import Effort as Effort
     from mpmopt.design.terms import Speed as Speed
     from mpmopt.design.terms import Volume as Volume
+    from mpmopt.design.variables import Bounded as Bounded
+    from mpmopt.design.variables import Frozen as Frozen
+    from mpmopt.design.variables import Tied as Tied
     from mpmopt.design.variation import Variation as Variation
     from mpmopt.optimisation.loop import optimise as optimise
     from mpmopt.optimisation.minimize import minimize as minimize

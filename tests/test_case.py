@@ -14,11 +14,12 @@ import numpy as np
 import pytest
 from walker import CASES, slanted_legs, walker
 
-from mpmopt.app.case import START, Case, ProgressBar, resume, run
+from mpmopt.app.case import Case, ProgressBar, resume, run
 from mpmopt.app.script import main
 from mpmopt.assess.threshold import pieces
 from mpmopt.design.problem import Problem
 from mpmopt.design.task import Task
+from mpmopt.design.variables import START
 from mpmopt.errors import DesignError, RunFileError, StorageError
 from mpmopt.optimisation.loop import optimise
 from mpmopt.optimisation.presets import IN_ONE_PIECE
@@ -165,8 +166,8 @@ def test_a_picture_that_fails_spoils_no_run(tmp_path, caplog, monkeypatch, how):
 
 def test_a_start_is_filled_up_and_knows_its_names():
     assert dataclasses.replace(TINY, start={"b": 0.1}).start == {**START, "b": 0.1}
-    with pytest.raises(DesignError, match="start has omega"):
-        dataclasses.replace(TINY, start={"omega": 0.1})
+    with pytest.raises(DesignError, match="start has gamma"):
+        dataclasses.replace(TINY, start={"gamma": 0.1})
 
 
 def test_what_a_folder_holds_is_overwritten_only_by_force(tmp_path):

@@ -226,9 +226,9 @@ def test_a_body_that_hangs_together_through_others_is_optimised():
     check_body_fits(halves)
 
 
-def test_a_picture_as_phi_is_told_where_its_entries_are():
-    with pytest.raises(DesignError, match=r"\(4, 8\).*\(32,\).*column by column from below; look"):
-        PROBLEM.join(np.zeros((4, 8)), 0.0, 0.0, 0.0)
+def test_phi_is_told_where_its_entries_are():
+    with pytest.raises(DesignError, match=r"\(31,\), must have \(32,\) or \(\), or be a picture"):
+        PROBLEM.join(np.zeros(31), 0.0, 0.0, 0.0)
     with pytest.raises(DesignError, match=r"b has shape \(3,\), must have \(2,\) or \(\)$"):
         PROBLEM.join(0.0, 0.0, 0.0, [0.0, 0.1, 0.2])
     found = doctest.DocTestFinder().find(Problem.join, "join", globs={})

@@ -325,7 +325,7 @@ def test_an_own_term_needs_two_methods(x):
         (lambda: Task.from_json("no"), "is no task"),
         (lambda: Task.from_json("3"), "text = 3 .* class Task"),
         (lambda: Task.from_json('{"kind": "Speed"}'), "class Task"),
-        (lambda: Task.from_json('{"kind": "os"}'), "kind = 'os' must be one of AtMost, Disp"),
+        (lambda: Task.from_json('{"kind": "os"}'), "kind = 'os' must be one of AtMost, Bou"),
         (lambda: Task.from_json('{"kind": "Task", "minimise": 3}'), "unexpected keyword"),
     ],
 )
@@ -348,4 +348,5 @@ def test_json_holds_numbers_and_names_only():
         "subject_to": [{"kind": "AtMost", "term": {"kind": "Volume"}, "bound": 0.4}],
         "scenes": [],
         "soft_minimum": 0.0,
+        "variables": [],
     }

@@ -17,9 +17,11 @@ from mpmopt.app.summary import summarise
 from mpmopt.assess.threshold import Baseline
 from mpmopt.design.problem import Problem
 from mpmopt.design.task import DEFAULT_TASK, Task
+from mpmopt.design.variables import completed
 from mpmopt.errors import DesignError, RunFileError, StorageError
 from mpmopt.io.console import say
 from mpmopt.io.files import locked, make_folder, refuse_existing, replace_file
+from mpmopt.io.pictures import read_picture
 from mpmopt.io.progress import Progress
 from mpmopt.optimisation.history import Optimisation
 from mpmopt.optimisation.loop import HOW, begin, go_on
@@ -36,7 +38,6 @@ logger = logging.getLogger(__name__)
 RESULTS = (
     "summary.json", "design.png", "history.png", "stride.png", "gait.png", "robustness.png",
 )  # fmt: skip
-START = {"phi": 0.0, "a": 1.0, "theta": -0.3, "b": -0.5}
 
 
 @dataclass(frozen=True)
@@ -51,8 +52,8 @@ class Case:
         From positions (D, 2) of the design particles to which are there (D,): a second reference
         design besides the solid reference design.
     start : mapping, optional
-        First phi, a, theta and b, as `Problem.join` takes them: one number for all actuators, or
-        one for each. What is left out is that of `START`.
+        First phi, a, theta, b and omega, as `Problem.join` takes them; phi may also be the path of
+        a PNG (`read_picture`). What is left out is that of `variables.START`.
     task : Task, optional
         Objective and constraints; default: the displacement.
 
@@ -78,11 +79,10 @@ class Case:
                 f"Case: baseline = {shown(self.baseline)} must be a function of positions (D, 2), "
                 "such as binary.solid_reference"
             )
-        if unknown := set(self.start) - set(START):
-            raise DesignError(
-                f"Case: start has {', '.join(unknown)}; its names are {', '.join(START)}"
-            )
-        object.__setattr__(self, "start", {**START, **self.start})
+        start = completed("Case", self.start)
+        if isinstance(start["phi"], (str, os.PathLike)):
+            start["phi"] = read_picture(start["phi"])
+        object.__setattr__(self, "start", start)
 
 
 class ProgressBar:
@@ -151,11 +151,9 @@ def run(
     folder = path.parent
     first = case.settings.stages[0]
     problem = Problem(first.scene(case.scene), first.beta, checkpointing)
-    position = problem.particles.position[problem.particles.designed]
     if phi is not None and not callable(phi):
         raise DesignError(f"run: phi = {shown(phi)} must be a function of positions (D, 2)")
-    plain = case.start if phi is None else {**case.start, "phi": phi(position)}
-    start = problem.join(**plain)
+    start = problem.join(**(case.start if phi is None else {**case.start, "phi": phi}))
     new, baseline = begin(case.scene, case.settings, start, case.task), baseline_particles(case)
     make_folder(folder)
     with locked(path):
@@ -169,7 +167,7 @@ def run(
             begun = kept.run.first.x if kept.run.first else kept.run.x
             its = kept.run.scene, kept.run.settings, kept.run.task
             same = its == (case.scene, case.settings, case.task)
-            if not same or not np.array_equal(begun, start):
+            if not same or not np.array_equal(begun, new.x):
                 raise StorageError(
                     f"{path} holds an earlier run of another case; choose another folder, or "
                     "--force to replace it"

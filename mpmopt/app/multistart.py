@@ -25,6 +25,7 @@ from mpmopt.optimisation.loop import check_body_fits
 from mpmopt.optimisation.settings import Settings
 from mpmopt.results import runfile
 from mpmopt.scene import Design, Scene
+from mpmopt.scene.particles import discretise
 from mpmopt.validation import count, digits, instance, place
 
 logger = logging.getLogger(__name__)
@@ -164,10 +165,14 @@ def multistart(
     table, picture = out / "starts.csv", out / "starts.png"
     if not (out / "starts.h5").exists():
         refuse_existing((table, picture), force)
+    start = dict(case.start)
+    if callable(start["phi"]):
+        particles = discretise(case.settings.stages[0].scene(case.scene))
+        start["phi"] = start["phi"](particles.position[particles.designed])
     plan = {
         "scene": case.scene.to_json(),
         "settings": dataclasses.asdict(case.settings),
-        "start": {name: np.asarray(value).tolist() for name, value in case.start.items()},
+        "start": {name: np.asarray(value).tolist() for name, value in start.items()},
         "task": case.task.to_json(),
     }
     function = functools.partial(one_start, baseline=case.baseline, out=out)

@@ -18,7 +18,8 @@ from mpmopt.assess.threshold import (
     solid_reference,
     unactuated,
 )
-from mpmopt.design.problem import Variables
+from mpmopt.design.actuation import frequencies
+from mpmopt.design.variables import Variables
 from mpmopt.errors import SimulationError
 from mpmopt.optimisation.history import Optimisation
 from mpmopt.validation import digits, instance
@@ -43,7 +44,7 @@ def summarise(
     first = result.first
     assert first is not None
     there = baseline.get(result.settings.stages[best.stage].coarsening)
-    actuations = [Variables.of(item.x, item.gamma.size) for item in (first, best)]
+    actuations = [Variables.of(item.x, problem.scene) for item in (first, best)]
     actuation = actuations[1]
     reference = _value_or_none(
         lambda: best_actuated(problem.scene, solid_reference, *actuations, task=result.task)
@@ -84,12 +85,23 @@ def summarise(
         "a": numbers(actuation.a),
         "theta": numbers(actuation.theta),
         "b": numbers(actuation.b),
+        **_chosen(result, actuation),
         "evaluations": len(result.history),
         "failed_evaluations": result.failed_evaluations,
         "halved_evaluations": result.halved_evaluations,
         "seconds": result.history[-1].seconds,
         "stop_reason": result.stop_reason,
     }
+
+
+def _chosen(result: Optimisation, actuation: Variables) -> dict[str, Any]:
+    """Frequencies, if they are designed, and what was not free, if anything."""
+    found: dict[str, Any] = {}
+    if actuation.omega.size:
+        found["angular_frequency"] = frequencies(result.scene, actuation.omega).tolist()
+    if result.task.variables:
+        found["variables"] = [str(restriction) for restriction in result.task.variables]
+    return found
 
 
 def _constraints(result: Optimisation) -> dict[str, Any]:

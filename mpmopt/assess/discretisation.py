@@ -17,10 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpmopt.assess.threshold import NO_GAIN
-from mpmopt.design.problem import Problem, Variables
+from mpmopt.design.problem import Problem
 from mpmopt.design.step_control import LIMITS
 from mpmopt.design.task import DEFAULT_TASK, Task
 from mpmopt.design.term import Outcome
+from mpmopt.design.variables import Variables
 from mpmopt.errors import DesignError, SceneError, SimulationError
 from mpmopt.scene import Actuator, Grid, Mirror, Scene
 from mpmopt.scene.particles import mirror_images
@@ -179,7 +180,7 @@ def density(
     Returns
     -------
     (M,) array
-        Sums of dL/dphi over the squares of the whole grid, then dL/da, dL/dtheta, dL/db.
+        Sums of dL/dphi over the squares of the whole grid, then those of the actuation.
     """
     particles = problem.particles
     position = particles.position[particles.designed]
@@ -188,10 +189,8 @@ def density(
         position[:, plane.normal] = np.minimum(across, 2.0 * plane.position - across)
     columns, rows = (math.ceil(side / patch - 1e-6) for side in problem.scene.grid.size)
     i, j = np.floor(position / patch).astype(int).T
-    parts = Variables.of(gradient, len(position))
-    return np.concatenate(
-        [np.bincount(i * rows + j, parts.phi, columns * rows), parts.a, parts.theta, parts.b]
-    )
+    phi, *actuation = Variables.of(gradient, problem.scene)
+    return np.concatenate([np.bincount(i * rows + j, phi, columns * rows), *actuation])
 
 
 def timed(run: Callable[[], Any], repeats: int = 1) -> tuple[Any, float]:

@@ -19,8 +19,9 @@ from scipy.ndimage import label
 from mpmopt.assess import threshold
 from mpmopt.assess.threshold import SOLID_LIMITS, solid_body
 from mpmopt.design.objective import Objective
-from mpmopt.design.problem import Problem, Variables
+from mpmopt.design.problem import Problem
 from mpmopt.design.step_control import check_indicators
+from mpmopt.design.variables import Variables
 from mpmopt.errors import SceneError, SimulationError
 from mpmopt.kernels import parts
 from mpmopt.scene import Grid, Scene

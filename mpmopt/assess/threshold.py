@@ -8,12 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import label
 
-from mpmopt.design.actuation import signal
+from mpmopt.design.actuation import sizes
 from mpmopt.design.ensemble import side_by_side
-from mpmopt.design.problem import Problem, Variables
+from mpmopt.design.problem import Problem
 from mpmopt.design.step_control import LIMITS, check_indicators
 from mpmopt.design.task import DEFAULT_TASK, Task
 from mpmopt.design.term import Outcome
+from mpmopt.design.variables import Variables
 from mpmopt.design.variation import Variation
 from mpmopt.errors import DesignError, SimulationError
 from mpmopt.scene import Scene
@@ -44,15 +45,16 @@ def solid_body(scene: Scene, keep: NDArray[np.bool_], variables: Variables) -> S
     keep : (D,) array of bool
         Design particles that are there; the others are not simulated at all.
     variables : Variables
-        Its a, theta and b are the actuation.
+        All but phi is the actuation.
 
     Raises
     ------
     DesignError
-        If `keep` has another size, or the actuation is not within [-1, 1].
+        If `keep` or the actuation has another size, or that is not within [-1, 1].
     """
-    for name in ("a", "theta", "b"):
-        value = getattr(variables, name)
+    for (name, value), size in zip(list(variables._asdict().items())[1:], sizes(scene)):
+        if np.shape(value) != (size,):
+            raise DesignError(f"{name} has shape {np.shape(value)}, must have {(size,)}")
         if np.iscomplexobj(value) or not np.all(np.abs(value) <= 1.0):
             raise DesignError(f"{name} = {value} must be real and within [-1, 1]")
     particles = discretise(scene)
@@ -68,7 +70,7 @@ def solid_body(scene: Scene, keep: NDArray[np.bool_], variables: Variables) -> S
         particles,
         density=of_solid(scene, particles, "density"),
         stiffness=ones,
-        signal=signal(scene, variables.a, variables.theta, variables.b),
+        signal=variables.signal(scene),
     )
 
 

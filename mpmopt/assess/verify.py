@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpmopt import kernels
-from mpmopt.design.actuation import signal, signal_adjoint
+from mpmopt.design.actuation import labels, signal, signal_adjoint, sizes
 from mpmopt.design.chain import DesignChain
 from mpmopt.design.objective import Objective
 from mpmopt.design.problem import Problem
@@ -149,12 +149,16 @@ def kernel_mismatches(scene: Scene, seed: int = 0) -> dict[str, float]:
             {"phi": rng.uniform(-0.5, 0.5, int(bench.particles.designed.sum()))},
             rng,
         )
-    count = len(scene.actuators)
-    if count:
+    if scene.actuators:
         result["signal"] = dot_product_mismatch(
-            lambda v: {"s": signal(scene, v["a"], v["theta"], v["b"])},
-            lambda v, w: dict(zip(v, signal_adjoint(scene, v["a"], v["theta"], w["s"]))),
-            {name: rng.uniform(-1.0, 1.0, count) for name in ("a", "theta", "b")},
+            lambda v: {"s": signal(scene, **v)},
+            lambda v, w: dict(
+                zip(v, signal_adjoint(scene, v["a"], v["theta"], w["s"], v["omega"]))
+            ),
+            {
+                name: rng.uniform(-1.0, 1.0, size)
+                for name, size in zip(("a", "theta", "b", "omega"), sizes(scene))
+            },
             rng,
         )
 
@@ -512,17 +516,17 @@ def _complex_steps(
     sides = (problem.evaluate(np.clip(x + s * move, -1.0, 1.0)) for s in (-1.0, 1.0))
     change = sum(np.linalg.norm(other.gradients - gradients, axis=1) for other in sides)
     rounding = ulp * np.array([max(problem.scene.grid.size), *len(problem.task.subject_to) * [1.0]])
-    variables = problem.split(np.arange(x.size) / x.size)
+    names = labels(problem.scene)
+    designed = x.size - len(names)
     vectors = {}
-    for number in range(directions if variables.phi.size else 0):
+    for number in range(directions if designed else 0):
         d = np.zeros(x.size)
-        d[: variables.phi.size] = rng.standard_normal(variables.phi.size)
+        d[:designed] = rng.standard_normal(designed)
         vectors[f"phi along direction {number}"] = d
-    for name in ("a", "theta", "b"):
-        for k, index in enumerate(np.rint(getattr(variables, name) * x.size).astype(int)):
-            d = np.zeros(x.size)
-            d[index] = 1.0
-            vectors[f"{name} of actuator {k}"] = d
+    for k, name in enumerate(names):
+        d = np.zeros(x.size)
+        d[designed + k] = 1.0
+        vectors[name] = d
     for name, d in vectors.items():
         exact, terms = _derivatives(problem, x + 1j * COMPLEX_STEP * d)
         length = np.linalg.norm(d)

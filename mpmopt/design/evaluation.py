@@ -19,7 +19,7 @@ class Evaluation:
     ----------
     value : float or complex
         Objective L.
-    gradient : (D + 3 K,) array
+    gradient : (n,) array
         Empty if only the value was asked for.
     indicators : Indicators
         Of the run that counts.
@@ -29,7 +29,7 @@ class Evaluation:
         How often the step was halved to get there.
     constraints : (m,) array
         Values of the constraints' terms, in the task's order.
-    jacobian : (m, D + 3 K) array
+    jacobian : (m, n) array
         Their gradients; empty if only values were asked for.
     scenes : tuple of float
         The objective in each scene of the task; empty if it has one.
@@ -46,5 +46,5 @@ class Evaluation:
 
     @property
     def gradients(self) -> NDArray[np.float64]:
-        """Those of the objective and of the constraints' terms (1 + m, D + 3 K)."""
+        """Those of the objective and of the constraints' terms (1 + m, n)."""
         return np.vstack([self.gradient, *self.jacobian])

@@ -5,18 +5,20 @@ from __future__ import annotations
 import copy
 import dataclasses
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mpmopt.design.actuation import signal, signal_adjoint
+from mpmopt.design.actuation import signal_adjoint, sizes
 from mpmopt.design.chain import DesignChain
 from mpmopt.design.ensemble import side_by_side, together
 from mpmopt.design.evaluation import Evaluation
+from mpmopt.design.picture import looked_up
 from mpmopt.design.step_control import LIMITS, check_indicators, too_long, with_halvings
 from mpmopt.design.task import DEFAULT_TASK, Task
 from mpmopt.design.term import Adjoints, Outcome
+from mpmopt.design.variables import Variables
 from mpmopt.design.variation import Variation
 from mpmopt.errors import DesignError
 from mpmopt.scene import Scene
@@ -28,39 +30,12 @@ from mpmopt.simulation.indicators import Indicators
 from mpmopt.simulation.simulation import Gradient, Precision, Simulation, check_precision
 from mpmopt.validation import count, instance, share
 
-ORDER_HINT = (
-    ": its entries are values at problem.particles.position[problem.particles.designed], column by "
-    "column from below; look a picture up there (see Problem.join), do not ravel it"
-)
-
-
-class Variables(NamedTuple):
-    """Design variables by name, each within [-1, 1].
-
-    Attributes
-    ----------
-    phi : (D,) array
-        Of the design particles.
-    a, theta, b : (K,) arrays
-        Amplitude, phase and bias of the actuators.
-    """
-
-    phi: NDArray
-    a: NDArray
-    theta: NDArray
-    b: NDArray
-
-    @classmethod
-    def of(cls, x: NDArray, designed: int) -> Variables:
-        """The parts of a vector x whose first `designed` entries are phi."""
-        phi, rest = x[:designed], x[designed:]
-        return cls(phi, *rest.reshape(3, -1))
-
 
 class Problem:
     """What a design achieves of a task in a scene, and which way to change it.
 
-    The vector x of an optimiser is phi, a, theta, b in this order, all within [-1, 1].
+    The vector x of an optimiser is phi, a, theta, b, omega in this order (`Variables`), all within
+    [-1, 1].
 
     Parameters
     ----------
@@ -89,7 +64,7 @@ class Problem:
     particles : Particles
     chain : DesignChain
     size : int
-        Number of design variables, D + 3 K.
+        Number n of design variables; D + 3 K of K actuators with one harmonic and no detuning.
 
     Raises
     ------
@@ -126,8 +101,7 @@ class Problem:
         self.limits = limits
         self.particles = discretise(scene)
         self.chain = DesignChain(scene, self.particles, beta)
-        self._designed = int(self.particles.designed.sum())
-        self.size = self._designed + 3 * len(scene.actuators)
+        self.size = int(self.particles.designed.sum()) + sum(sizes(scene))
         self.members = tuple(self._member(variation) for variation in task.scenes)
 
     def _member(self, variation: Variation) -> Problem:
@@ -142,12 +116,16 @@ class Problem:
         )
         return member
 
-    def join(self, phi: Any, a: Any, theta: Any, b: Any) -> NDArray[np.float64]:
+    def join(self, phi: Any, a: Any, theta: Any, b: Any, omega: Any = 0.0) -> NDArray[np.float64]:
         """The vector x of named variables; single numbers stand for all entries.
 
-        The entries of phi belong to the design particles, column by column from below, whatever
-        their regions: to positions, not to the rows of a picture. So a picture is looked up there;
-        one that is raveled would be scrambled, and no size tells.
+        Parameters
+        ----------
+        phi : (rows, columns) array, callable, (D,) array or float
+            A picture (`looked_up`); a function of the design particles' positions (D, 2), which
+            gives phi (D,); or phi itself, column by column of particles from below.
+        a, theta, b, omega : arrays or float
+            As in `Variables`.
 
         Raises
         ------
@@ -163,20 +141,25 @@ class Problem:
         >>> body = Design((4 * c, 4 * c), (8 * c, 6 * c)), Actuator((4 * c, 6 * c), (8 * c, 7 * c))
         >>> problem = Problem(Scene(Grid((16, 16), c), 4e-3, 10, body))
         >>> picture = np.array([[1.0, 1.0, 1.0, 1.0], [1.0, -1.0, -1.0, 1.0]])  # two legs
-        >>> right, up = problem.particles.position[problem.particles.designed].T
-        >>> row, column = ((6 * c - up) / c).astype(int), ((right - 4 * c) / c).astype(int)
-        >>> x = problem.join(picture[row, column], a=1.0, theta=-0.3, b=-0.5)
+        >>> x = problem.join(picture, a=1.0, theta=-0.3, b=-0.5)
         >>> print(x[:8])  # the first two columns of particles: the left leg
         [1. 1. 1. 1. 1. 1. 1. 1.]
         >>> print(x[8:12])  # the next one: the gap, and the row above it
         [-1. -1.  1.  1.]
+        >>> legs = problem.join(lambda position: 1.0 - 2.0 * (position[:, 0] < 6 * c), 1, 0, 0)
         """
-        sizes = (self._designed,) + 3 * (len(self.scene.actuators),)
+        position = self.particles.position[self.particles.designed]
+        phi = _real("phi", phi(position.copy()) if callable(phi) else phi)
+        vector = phi.size == len(position) and 1 in phi.shape
+        if phi.ndim == 2 and not vector:
+            phi = looked_up(phi, self.scene, position)
         parts = []
-        for name, value, size in zip(Variables._fields, (phi, a, theta, b), sizes):
+        for name, value, size in zip(
+            Variables._fields, (phi, a, theta, b, omega), (len(position), *sizes(self.scene))
+        ):
             array = _real(name, value)
             if array.size not in (1, size) or array.ndim > 1:
-                hint = ORDER_HINT if name == "phi" else ""
+                hint = ", or be a picture or a function of positions" if name == "phi" else ""
                 raise DesignError(
                     f"{name} has shape {array.shape}, must have {(size,)} or (){hint}"
                 )
@@ -204,7 +187,7 @@ class Problem:
                 f"{outside.sum()} of {x.size} design variables are not within [-1, 1], the first "
                 f"is x[{outside.argmax()}] = {x[outside.argmax()]}"
             )
-        return Variables.of(x, self._designed)
+        return Variables.of(x, self.scene)
 
     def transfer(self, other: Problem, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """The design x of another problem as one of this problem, whose grid is another.
@@ -214,7 +197,7 @@ class Problem:
         instance("Problem.transfer", "other", other, Problem)
         parts = other.split(x)
         phi = parts.phi[nearest_designed(self.particles, other.particles)]
-        return self.join(phi, parts.a, parts.theta, parts.b)
+        return self.join(phi, *parts[1:])
 
     def gamma(self, x: NDArray) -> NDArray:
         """Material density (D,) of the design particles."""
@@ -228,14 +211,14 @@ class Problem:
 
     def simulation(self, x: NDArray) -> Simulation:
         """The simulation of a design."""
-        phi, a, theta, b = self.split(x)
-        present, field = self.present(phi), self.chain.field(phi)
+        variables = self.split(x)
+        present, field = self.present(variables.phi), self.chain.field(variables.phi)
         return simulation_of(
             self.scene,
             self.particles.subset(present),
             field.density[present],
             field.stiffness[present],
-            signal(self.scene, a, theta, b),
+            variables.signal(self.scene),
             precision=self.precision,
         )
 
@@ -270,7 +253,7 @@ class Problem:
         return self._evaluation(x, Problem._value).constraints
 
     def value_and_gradient(self, x: NDArray) -> tuple[float, NDArray[np.float64]]:
-        """Objective L and its gradient (D + 3 K,), by the reverse loop.
+        """Objective L and its gradient (n,), by the reverse loop.
 
         Raises
         ------
@@ -363,10 +346,10 @@ class Problem:
     def _pullback(
         self, variables: Variables, bars: Adjoints, sweep: Gradient | None
     ) -> NDArray[np.float64]:
-        """The gradient (D + 3 K,) of a term, from its adjoints and the sweep that they began."""
-        phi, a, theta, _ = variables
+        """The gradient (n,) of a term, from its adjoints and the sweep that they began."""
+        phi, a, theta, b, omega = variables
         density_bar, stiffness_bar = np.zeros((2, len(self.particles.position)))
-        signal_bar = np.zeros((self.scene.steps, a.size)) + bars.signal
+        signal_bar = np.zeros((self.scene.steps, b.size)) + bars.signal
         if sweep is not None:
             present = self.present(phi)
             density_bar[present], stiffness_bar[present] = sweep.density, sweep.stiffness
@@ -375,7 +358,8 @@ class Problem:
             density_bar[self.present(phi)] += bars.density
             stiffness_bar[self.present(phi)] += bars.stiffness
         phi_bar = self.chain.field(phi).pullback(density_bar, stiffness_bar, bars.gamma)
-        return np.concatenate([phi_bar, *signal_adjoint(self.scene, a, theta, signal_bar)])
+        actuation_bar = signal_adjoint(self.scene, a, theta, signal_bar, omega)
+        return np.concatenate([phi_bar, *actuation_bar])
 
     def _check(self, indicators: Indicators, simulation: Simulation) -> None:
         if self.limits is not None:

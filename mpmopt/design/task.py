@@ -1,4 +1,4 @@
-"""What an optimisation does: an objective to maximise, constraints, and the scenes they hold in."""
+"""What an optimisation does: objective, constraints, scenes they hold in, what is not free."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from mpmopt.design.term import Term
 from mpmopt.design.terms import TERMS, Displacement
+from mpmopt.design.variables import Bounded, Frozen, Restriction, Tied
 from mpmopt.design.variation import Variation
 from mpmopt.errors import DesignError
 from mpmopt.scene import Ground, Scene
@@ -72,11 +73,14 @@ class Task(Checked):
         The ensemble, by what differs from the scene; none: the scene as it is.
     soft_minimum : float, optional
         Sharpness k, in units of 1 / L: 0 is the mean, large ones tend to the worst scene.
+    variables : tuple of Frozen, Bounded or Tied, optional
+        Which variables an optimiser may not choose within all of [-1, 1]. It moves its start there
+        (`Freedom`).
 
     Raises
     ------
     DesignError
-        If one is no term, no constraint or no scene, or the sharpness is negative.
+        If one is no term, constraint, scene or restriction, or the sharpness is negative.
 
     Examples
     --------
@@ -91,12 +95,14 @@ class Task(Checked):
     subject_to: tuple[AtMost, ...] = ()
     scenes: tuple[Variation, ...] = ()
     soft_minimum: float = 0.0
+    variables: tuple[Restriction, ...] = ()
 
     def __post_init__(self) -> None:
         instance("Task", "maximise", self.maximise, Term, "such as Displacement()")
         for name, kind, such in (
             ("subject_to", AtMost, "such as AtMost(Volume(), 0.4)"),
             ("scenes", Variation, "such as Variation(friction=0.3)"),
+            ("variables", Restriction, 'such as Frozen("theta")'),
         ):
             given: Any = getattr(self, name)
             items = tuple(given) if isinstance(given, Iterable) else (given,)
@@ -166,7 +172,9 @@ class Task(Checked):
 
 
 DEFAULT_TASK = Task()
-_KINDS = {kind.__name__: kind for kind in (Task, AtMost, Variation, Ground, *TERMS)}
+_KINDS = {
+    kind.__name__: kind for kind in (Task, AtMost, Variation, Ground, Frozen, Bounded, Tied, *TERMS)
+}
 
 
 def _plain(value: Any) -> Any:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from mpmopt.assess.threshold import post_processed
 from mpmopt.design.chain import non_discreteness
 from mpmopt.design.problem import Problem
 from mpmopt.design.task import DEFAULT_TASK, FEASIBLE, Task
+from mpmopt.design.variables import Freedom, completed
 from mpmopt.errors import DesignError, SceneError, SimulationError
 from mpmopt.optimisation.history import Candidate, Iteration, Optimisation, StageState
 from mpmopt.optimisation.mma import MovingAsymptotes
@@ -39,7 +40,7 @@ HOW = "write Settings(stages), or call what makes them, such as continuation(tim
 def optimise(
     scene: Scene,
     settings: Settings,
-    start: NDArray[np.float64] | Sequence[float],
+    start: NDArray[np.float64] | Sequence[float] | Mapping[str, Any],
     callbacks: Iterable[Callback] | Callback = (),
     checkpointing: Checkpointing | None = None,
     task: Task = DEFAULT_TASK,
@@ -55,8 +56,10 @@ def optimise(
     ----------
     scene : Scene
     settings : Settings
-    start : (n,) array
-        First design, within [-1, 1], of the first stage's scene (`Problem.join` makes it).
+    start : mapping or (n,) array
+        First design, within [-1, 1]: what `Problem.join` takes, by name, such as
+        ``{"phi": picture}``, the rest as in `variables.START`; or the vector that it makes for the
+        first stage's scene.
     callbacks : iterable of callable, or one
         Called after each evaluation and once at the end.
     checkpointing : Checkpointing, optional
@@ -92,7 +95,12 @@ def begin(scene: Scene, settings: Settings, start: Any, task: Task = DEFAULT_TAS
     if first.size == 0:
         raise DesignError("there is nothing to design: give a Design or an Actuator")
     check_body_fits(scene)
-    return Optimisation(scene, settings, task, first.join(*first.split(start)))
+    if isinstance(start, Mapping):
+        start = first.join(**completed("optimise", start))
+    freedom = Freedom(scene, first.size, task.variables)
+    if freedom.lower.size == 0:
+        raise DesignError("there is nothing to design: the task's variables leave none free")
+    return Optimisation(scene, settings, task, freedom.started(first.join(*first.split(start))))
 
 
 def check_body_fits(scene: Scene) -> None:
@@ -232,9 +240,10 @@ class _Ascent:
         self.width = max(self.run.scene.grid.size)
         state = self.run.stage_state
         self._pose(state.time_step if state else None)
+        self.freedom = Freedom(self.run.scene, self.problem.size, run.task.variables)
         self.mma = MovingAsymptotes(
-            -np.ones(self.problem.size),
-            np.ones(self.problem.size),
+            self.freedom.lower,
+            self.freedom.upper,
             move_limit=self.stage.move_limit,
             asymptote_initial=0.5 / (self.stage.beta + 1.0) if settings.sharpen_asymptotes else 0.5,
         )
@@ -312,15 +321,16 @@ class _Ascent:
 
     def _move(self, item: Candidate, gradients: NDArray[np.float64]) -> NDArray[np.float64]:
         """The step of the moving asymptotes from a design."""
+        x, gradients = self.freedom.reduced(item.x), self.freedom.pullback(gradients)
         f, dfdx = -item.objective / self.width, -gradients[0] / self.width
         constraints = self.run.task.subject_to
         if not constraints:
-            return self.mma.step(item.x, f, dfdx)
+            return self.freedom.whole(item.x, self.mma.step(x, f, dfdx))
         scale = np.array([constraint.scale for constraint in constraints])
         g = [constraint.g(value) for constraint, value in zip(constraints, item.constraints)]
-        x = self.mma.step(item.x, f, dfdx, g, gradients[1:] / scale[:, None])
+        x = self.mma.step(x, f, dfdx, g, gradients[1:] / scale[:, None])
         self.multipliers = tuple((self.mma.multipliers * self.width / scale).tolist())
-        return x
+        return self.freedom.whole(item.x, x)
 
     def _best_before(self) -> NDArray[np.float64] | None:
         """The best design of the stage before, on this stage's grid."""
@@ -364,7 +374,8 @@ class _Ascent:
         before = run.last.x if run.last else x
         if before.size != x.size:  # another grid
             before = x
-        free = np.where(gradients[0] > 0.0, x < 1.0, x > -1.0)
+        slope, free = self.freedom.pullback(gradients[0]), self.freedom.reduced(x)
+        movable = np.where(slope > 0.0, free < self.freedom.upper, free > self.freedom.lower)
         gamma = self.problem.gamma(x)
         candidate = Candidate(
             stage=run.stage,
@@ -375,7 +386,7 @@ class _Ascent:
             gamma=gamma,
             objective=value,
             non_discreteness=non_discreteness(gamma),
-            projected_gradient=float(np.abs(gradients[0] * free).max()),
+            projected_gradient=float(np.abs(slope * movable).max()),
             step=float(np.abs(x - before).max() / 2.0),
             seconds=time.monotonic() - self.began,
             post_processed=solid,

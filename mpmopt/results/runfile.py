@@ -6,7 +6,7 @@ Layout (version 6)::
                      settings, task, versions, summary
     x                the design that the stage began with
     history/NAME     one entry per evaluation: objective, beta, non_discreteness, step, ...
-    best/            the best of all, with gamma, phi, a, theta, b; attribute stage
+    best/            the best of all, with gamma, phi, a, theta, b, omega; attribute stage
     stages/K/        the best design of stage K: x, gamma; attributes of its evaluation
     first/, last/    the first and the last evaluation, in the same way
     stage/           a stage that is under way: what its next step depends on
@@ -31,8 +31,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 import mpmopt
-from mpmopt.design.problem import Variables
 from mpmopt.design.task import Task
+from mpmopt.design.variables import Variables
 from mpmopt.errors import RunFileError, StorageError
 from mpmopt.io.checksums import LARGEST, SEAL, file_in_memory, refusing, sealed, unsealed
 from mpmopt.io.files import replace_file
@@ -141,7 +141,7 @@ def _fill(file: h5py.File, run: Optimisation) -> None:
         x, gamma = run.result.x, run.result.gamma
         group = file.create_group("best")
         group.attrs["stage"] = run.result.stage
-        for name, value in {"gamma": gamma, **Variables.of(x, gamma.size)._asdict()}.items():
+        for name, value in {"gamma": gamma, **Variables.of(x, run.scene)._asdict()}.items():
             group.create_dataset(name, data=value, dtype="f8")
 
 

@@ -17,8 +17,6 @@ if TYPE_CHECKING:
 
 # Numbers in any one array: 0.8 GB. What a scene would take is known before any of it is taken.
 MOST_NUMBERS = 10**8
-# s = a sin(...) + b with a and b within [-1, 1]
-LARGEST_SIGNAL = 2.0
 # Edges may miss a lattice line by rounding, in units of its spacing.
 ROUNDING = 1e-6
 
@@ -66,6 +64,7 @@ def check_size(scene: Scene) -> None:
     )
     areas = [(x1 - x0) * (y1 - y0) for (x0, y0), (x1, y1) in corners]
     particles, actuators = sum(areas), len(scene.actuators)
+    waves = sum(actuator.harmonics for actuator in scene.actuators)
     nodes = math.prod((b - a) // scene.particles_per_cell + 4 for a, b in zip(lower, upper))
     designed = sum(a for a, region in zip(areas, scene.body) if isinstance(region, Design))
     neighbours = min(designed, scene.filter_neighbours)
@@ -79,7 +78,7 @@ def check_size(scene: Scene) -> None:
         ),
         (
             f"{scene.steps} signals of {actuators} actuators",
-            actuators * scene.steps,
+            waves * scene.steps,
             "fewer steps",
         ),
         (
@@ -216,11 +215,11 @@ def check_stability(scene: Scene) -> None:
             "cells, a void density that is not below the void stiffness, or less viscosity"
         )
     for actuator in scene.actuators:
-        largest = LARGEST_SIGNAL * np.abs(np.linalg.eigvalsh(actuator.stress)).max()
+        largest = actuator.largest_signal * np.abs(np.linalg.eigvalsh(actuator.stress)).max()
         bearable = scene.material_of(actuator).elliptic_limit
         if bearable - largest <= 0.0:
             raise SceneError(
                 f"Scene: ellipticity can be lost: the material bears actuation stresses above "
                 f"-{bearable:g}, but they can reach -{largest:g} at a signal of "
-                f"{LARGEST_SIGNAL:g}; take a weaker actuator or a stiffer material"
+                f"{actuator.largest_signal:g}; take a weaker actuator or a stiffer material"
             )

@@ -9,7 +9,7 @@ from itertools import islice
 from typing import Any, ClassVar, Literal
 
 from mpmopt.errors import SceneError
-from mpmopt.validation import count, number, shown
+from mpmopt.validation import count, number, share, shown
 
 Vector = tuple[float, float]
 
@@ -222,13 +222,20 @@ class Actuator(Region):
     stress : ((float, float), (float, float))
         Second Piola-Kirchhoff stress S of a unit signal; symmetric.
     angular_frequency : float
-        omega of the signal s(t) = a sin(omega t + pi theta) + b, per unit of time.
+        omega of the signal s(t) = b + sum_h a_h sin(h omega t + pi theta_h), per unit of time.
+    harmonics : int
+        Number H of sines; one, as in the paper.
+    detuning : float
+        By how much of itself omega may change, as a design variable: from 0, where it is none, to
+        below 1.
     """
 
     kind = "actuator"
 
     stress: tuple[Vector, Vector] = ((2.0, 0.0), (0.0, 2.0))
     angular_frequency: float = 30.0
+    harmonics: int = 1
+    detuning: float = 0.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -240,7 +247,14 @@ class Actuator(Region):
                 f"{stress[0][1]!r} and S_yx = {stress[1][0]!r}"
             )
         omega = number("Actuator", "angular_frequency", self.angular_frequency, above=0.0)
-        self._set(stress=stress, angular_frequency=omega)
+        harmonics = count("Actuator", "harmonics", self.harmonics, 1)
+        detuning = share("Actuator", "detuning", self.detuning)
+        self._set(stress=stress, angular_frequency=omega, harmonics=harmonics, detuning=detuning)
+
+    @property
+    def largest_signal(self) -> float:
+        """The largest |s|: bias and amplitudes are at most 1 in size, so it is 1 + H."""
+        return 1.0 + self.harmonics
 
 
 @dataclass(frozen=True)
