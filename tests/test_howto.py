@@ -71,6 +71,11 @@ def test_the_lines_of_a_page_run(page, run_page):
         assert len(values) == 4 and not run.failed_evaluations
         if not run.task.subject_to:
             assert run.result.objective == max(values) > values[0]
+    if page == "anti_phase":
+        assert names["best"].a.tolist() == [names["best"].a[0], -names["best"].a[0]] != [0.0, 0.0]
+    if page == "from_a_picture":
+        assert np.array_equal(run.problem().split(names["start"]).a, [1.0, 1.0])
+        assert set(run.problem().split(names["start"]).phi) == {-0.5, 0.5}
     if page == "finger":
         assert 0.0 < -run.result.objective < -values[0]
     if page == "to_the_left":
