@@ -99,17 +99,17 @@ TASK = replace(
     scenes=(
         Variation(friction=0.28, strength=0.9, threshold=0.4),
         Variation(friction=0.45, thickness=2.0),
-        Variation(friction=0.7, strength=1.1, threshold=0.6),
+        Variation(friction=0.72, strength=1.1, threshold=0.6),
     ),
     soft_minimum=8.0,
 )
 
 CASES = {
     "default": Case(
-        walker_on_ground(64, 1e-3, 4.0), gait(1e-3, 25), slanted_legs_on_ground, START, TASK
+        walker_on_ground(64, 1e-3, 4.0), gait(1e-3, 30), slanted_legs_on_ground, START, TASK
     ),
     "preview": Case(
-        walker_on_ground(64, 1e-3, 3.0), gait(1e-3, 15), slanted_legs_on_ground, START, TASK
+        walker_on_ground(64, 1e-3, 3.0), gait(1e-3, 20), slanted_legs_on_ground, START, TASK
     ),
     "paper": Case(walker(128, 2e-4), paper_preset(2e-4), slanted_legs),
 }
