@@ -6,9 +6,9 @@ A robot is what would be built: without grey and void, and without what hangs on
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from threading import Lock
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -474,7 +474,7 @@ def _speeds(
     """The speed of each trial, None where there is none, and why."""
     speeds: dict[str, float | None] = dict.fromkeys(trials)
     failures: dict[str, str] = {}
-    one_at_a_time = Lock()
+    one_at_a_time = threading.Lock()
 
     def run(name: str) -> None:
         value = math.nan
