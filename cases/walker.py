@@ -57,7 +57,7 @@ def walker_on_ground(cells: int, time_step: float, seconds: float) -> Scene:
         grid=Grid(cells=(3 * cells // 2, cells), dx=1 / cells),
         body=tuple(body),
         walls=(),
-        ground=(Ground.floor(3 / 64, friction=0.5, thickness=1 / 64),),
+        ground=(Ground.floor(3 / 64, friction=0.5, thickness=1 / 64, damping=2.0),),
         material=Material(viscosity=0.03),
         steps=round(seconds / time_step),
         transient=1.0,
@@ -79,17 +79,22 @@ def slanted_legs(positions: np.ndarray) -> np.ndarray:
 
 
 def slanted_legs_on_ground(positions: np.ndarray) -> np.ndarray:
-    """The same legs under the body where `walker_on_ground` has it."""
-    return slanted_legs(positions - (AHEAD, 0.0))
+    """A thin hind leg and a wide front leg that lean back: the best of 200 drawings, at 54 a second.
+
+    Each was a trial of legs of other places, slants and widths, at other frequencies.
+    """
+    c = 1 / 64
+    x, y = positions.T
+    foot = 3.3 * c * (11 * c - y) / (7 * c)
+    return np.any([abs(x - AHEAD + foot - top * c) <= c for top in (12, 20, 21)], axis=0)
 
 
 def start(positions: np.ndarray) -> np.ndarray:
-    """A faint drawing of legs that lean back, with a little noise so that nothing is even."""
-    noise = np.random.default_rng(1).uniform(-0.02, 0.02, len(positions))
+    """The drawing, faintly, with a little noise so that nothing is even."""
+    noise = np.random.default_rng(1).uniform(-0.05, 0.05, len(positions))
     return np.where(slanted_legs_on_ground(positions), 0.4, -0.4) + noise
 
 
-# Nearly twice the paper's frequency, near to which such legs swing.
 START = {"phi": start, "omega": 0.9}
 
 # What nobody knows of the world: friction, softness of the ground, strength, and how exactly it was
