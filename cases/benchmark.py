@@ -123,7 +123,7 @@ def threads_and_schedules(steps: int, rounds: int) -> str:
 
 def formulations(steps: int, rounds: int) -> str:
     """The walker on ground, viscous, in both formulations, by one thread."""
-    scene = replace(walker_on_ground(128, 2e-4, 15), steps=steps, transient=0.0)
+    scene = replace(walker_on_ground(128, 2e-4, 4.0), steps=steps, transient=0.0)
     runs: dict[str, Run] = {}
     for kind in ("updated", "total"):
         problem = Problem(replace(scene, formulation=kind))

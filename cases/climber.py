@@ -7,33 +7,35 @@ on but a bottom far below, several actuators.
 """
 
 import sys
+from dataclasses import replace
 
 import numpy as np
 
 from mpmopt.app.case import Case
 from mpmopt.app.script import main
+from mpmopt.design.variation import Variation
 from mpmopt.optimisation.presets import IN_ONE_PIECE, gait
 from mpmopt.scene import Actuator, Design, Grid, Ground, Material, Mirror, Scene
 
 
-def climber(cells: int, time_step: float, periods: int) -> Scene:
-    """The climber on `cells` x `cells` cells; periods of its actuators after a second count."""
+def climber(cells: int, time_step: float, seconds: float) -> Scene:
+    """The climber on `cells` x `cells` cells; what comes in the first second does not count."""
     c = 1 / 64
     left, right, low, high = 26 * c, 38 * c, 18 * c, 42 * c  # of the body
     # The shaft's layers are a cell thick and squeeze the body a little, so that it holds at first.
     walls, bottom = (25.3 * c, 38.7 * c), 4 * c
     shaft = ((walls[0], 1.0), (walls[0], bottom), (walls[1], bottom), (walls[1], 1.0))
     actuators = tuple(Actuator((30 * c, y * c), (34 * c, (y + 6) * c)) for y in (21, 27, 33))
-    period = 2.0 * np.pi / actuators[0].angular_frequency
     return Scene(
         grid=Grid(cells=(cells, cells), dx=1 / cells),
         time_step=time_step,
-        steps=round((1.0 + periods * period) / time_step),
+        steps=round(seconds / time_step),
         transient=1.0,
         gravity=(0.0, -1.0),
         direction=(0.0, 1.0),
         ground=(Ground(shaft, friction=1.0, thickness=c),),
-        material=Material(viscosity=0.02),
+        material=Material(viscosity=0.03),
+        formulation="total",
         body=(
             Design((left, low), (right, 21 * c)),
             Design((left, 21 * c), (30 * c, 39 * c)),
@@ -57,9 +59,19 @@ def slanted_legs(positions: np.ndarray) -> np.ndarray:
 # Three cores a quarter of a turn apart, the lowest first; squeezed outwards on the average.
 START = {"phi": 0.0, "a": 1.0, "theta": (0.7, 0.2, -0.3), "b": -0.5}
 
+TASK = replace(
+    IN_ONE_PIECE,
+    scenes=(
+        Variation(friction=0.7, strength=0.9, threshold=0.4),
+        Variation(friction=0.9),
+        Variation(friction=1.2, strength=1.1, threshold=0.6),
+    ),
+    soft_minimum=8.0,
+)
+
 CASES = {
-    "default": Case(climber(64, 8e-4, 15), gait(8e-4, 25), slanted_legs, START, IN_ONE_PIECE),
-    "preview": Case(climber(64, 8e-4, 10), gait(8e-4, 12), slanted_legs, START, IN_ONE_PIECE),
+    "default": Case(climber(64, 1e-3, 4.0), gait(1e-3, 120), slanted_legs, START, TASK),
+    "preview": Case(climber(64, 1e-3, 3.0), gait(1e-3, 40), slanted_legs, START, TASK),
 }
 
 if __name__ == "__main__":

@@ -17,6 +17,7 @@ from mpmopt.app.case import Case
 from mpmopt.app.script import main
 from mpmopt.design.one_piece import OnePiece
 from mpmopt.design.task import AtMost, Task
+from mpmopt.design.variation import Variation
 from mpmopt.optimisation.presets import gait, paper_preset
 from mpmopt.scene import Actuator, Design, Grid, Ground, Material, Mirror, Scene, Wall
 
@@ -43,11 +44,13 @@ def crawler(cells: int, time_step: float, mirror: bool = True) -> Scene:
     )
 
 
-def crawler_on_ground(cells: int, time_step: float, periods: int) -> Scene:
-    """The same body in a longer channel with layers; periods after the first second count."""
+def crawler_on_ground(cells: int, time_step: float, seconds: float) -> Scene:
+    """The same body in a longer channel with layers, and with a frequency that is designed too.
+
+    What comes in the first second does not count.
+    """
     c = 1 / 64
     scene = crawler(cells, time_step)
-    omega = scene.actuators[0].angular_frequency
     layer = {"friction": 0.5, "thickness": c}
     return replace(
         scene,
@@ -57,10 +60,15 @@ def crawler_on_ground(cells: int, time_step: float, periods: int) -> Scene:
             Ground.floor(25 * c, **layer),
             Ground(((1.0, 39 * c), (0.0, 39 * c)), **layer),
         ),
-        material=Material(viscosity=0.02),
-        steps=round((1.0 + periods * 2.0 * np.pi / omega) / time_step),
+        body=tuple(
+            replace(part, detuning=0.9) if isinstance(part, Actuator) else part
+            for part in scene.body
+        ),
+        material=Material(viscosity=0.03),
+        steps=round(seconds / time_step),
         transient=1.0,
-        filter_length=2 * c,  # with thinner legs the grey stages fail
+        filter_length=2 * c,
+        formulation="total",
     )
 
 
@@ -75,18 +83,22 @@ def slanted_legs(positions: np.ndarray) -> np.ndarray:
 
 
 # A little noise: at an even start the gradient by the phase is rounding.
-START = {"phi": np.random.default_rng(1).uniform(-0.05, 0.05, 408)}  # 102 cells, 2 x 2 in each
+START = {"phi": np.random.default_rng(1).uniform(-0.05, 0.05, 408), "omega": 0.5}  # 102 cells
 
 # Its actuator takes heat from three sides, so the bound of other robots would let small corners go.
-IN_ONE_PIECE = Task(subject_to=(AtMost(OnePiece(), -0.4),))
+TASK = Task(
+    subject_to=(AtMost(OnePiece(), -0.4),),
+    scenes=(
+        Variation(friction=0.28, strength=0.9, threshold=0.4),
+        Variation(friction=0.45),
+        Variation(friction=0.72, strength=1.1, threshold=0.6),
+    ),
+    soft_minimum=8.0,
+)
 
 CASES = {
-    "default": Case(
-        crawler_on_ground(64, 8e-4, 15), gait(8e-4, 25), slanted_legs, START, IN_ONE_PIECE
-    ),
-    "preview": Case(
-        crawler_on_ground(64, 8e-4, 10), gait(8e-4, 12), slanted_legs, START, IN_ONE_PIECE
-    ),
+    "default": Case(crawler_on_ground(64, 1e-3, 4.0), gait(1e-3, 120), slanted_legs, START, TASK),
+    "preview": Case(crawler_on_ground(64, 1e-3, 3.0), gait(1e-3, 40), slanted_legs, START, TASK),
     "paper": Case(crawler(128, 2e-4), paper_preset(2e-4), slanted_legs),
 }
 

@@ -79,9 +79,9 @@ def slanted_legs(positions: np.ndarray) -> np.ndarray:
 
 
 def slanted_legs_on_ground(positions: np.ndarray) -> np.ndarray:
-    """A thin hind leg and a wide front leg that lean back: the best of 200 drawings, at 54 a second.
+    """A thin hind leg and a wide front leg that lean back: the best of 200 drawings.
 
-    Each was a trial of legs of other places, slants and widths, at other frequencies.
+    They had legs at other places, of other slants and widths, and other frequencies.
     """
     c = 1 / 64
     x, y = positions.T
@@ -92,7 +92,7 @@ def slanted_legs_on_ground(positions: np.ndarray) -> np.ndarray:
 def start(positions: np.ndarray) -> np.ndarray:
     """The drawing, faintly, with a little noise so that nothing is even."""
     noise = np.random.default_rng(1).uniform(-0.05, 0.05, len(positions))
-    return np.where(slanted_legs_on_ground(positions), 0.4, -0.4) + noise
+    return np.where(slanted_legs_on_ground(positions), 0.8, -0.8) + noise
 
 
 START = {"phi": start, "omega": 0.9}
@@ -111,10 +111,10 @@ TASK = replace(
 
 CASES = {
     "default": Case(
-        walker_on_ground(64, 1e-3, 4.0), gait(1e-3, 30), slanted_legs_on_ground, START, TASK
+        walker_on_ground(64, 1e-3, 4.0), gait(1e-3, 120), slanted_legs_on_ground, START, TASK
     ),
     "preview": Case(
-        walker_on_ground(64, 1e-3, 3.0), gait(1e-3, 20), slanted_legs_on_ground, START, TASK
+        walker_on_ground(64, 1e-3, 3.0), gait(1e-3, 40), slanted_legs_on_ground, START, TASK
     ),
     "paper": Case(walker(128, 2e-4), paper_preset(2e-4), slanted_legs),
 }

@@ -142,7 +142,7 @@ def test_starts_leave_their_runs_and_are_run_once(tmp_path, capsys, caplog):
 @pytest.mark.case
 def test_the_plain_start_is_that_of_the_case(tmp_path, here):
     case = Case(
-        dataclasses.replace(climber.climber(64, 8e-4, 1), steps=5, transient=0.0), TINY.settings,
+        dataclasses.replace(climber.climber(64, 8e-4, 2.0), steps=5, transient=0.0), TINY.settings,
         climber.slanted_legs, climber.START,
     )  # fmt: skip
     run(case, tmp_path / "alone")

@@ -226,7 +226,7 @@ def test_a_schematic_tells_all_that_is_there():
 
 @pytest.mark.parametrize(("friction", "said"), [(0.35, "friction 0.35"), ("stick", "stick")])
 def test_a_schematic_tells_the_friction_of_ground_inside_it(friction, said):
-    scene = walker_on_ground(64, 8e-4, 10)
+    scene = walker_on_ground(64, 8e-4, 4.0)
     points = ((0.0, 3 / 64), (0.3, 3 / 64), (0.6, 1 / 64))
     for ground in (Ground.floor(3 / 64, friction), Ground(points, friction)):
         (axes,) = schematic(dataclasses.replace(scene, ground=(ground,))).axes
