@@ -14,7 +14,7 @@ import numpy as np
 from mpmopt.app.case import Case
 from mpmopt.app.script import main
 from mpmopt.design.variation import Variation
-from mpmopt.optimisation.presets import IN_ONE_PIECE, gait
+from mpmopt.optimisation.presets import IN_ONE_PIECE, creep
 from mpmopt.scene import Actuator, Design, Grid, Ground, Material, Mirror, Scene
 
 
@@ -70,8 +70,8 @@ TASK = replace(
 )
 
 CASES = {
-    "default": Case(climber(64, 1e-3, 4.0), gait(1e-3, 120), slanted_legs, START, TASK),
-    "preview": Case(climber(64, 1e-3, 3.0), gait(1e-3, 40), slanted_legs, START, TASK),
+    "default": Case(climber(64, 1e-3, 4.0), creep(1e-3, 25), slanted_legs, START, TASK),
+    "preview": Case(climber(64, 1e-3, 3.0), creep(1e-3, 15), slanted_legs, START, TASK),
 }
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ from mpmopt.app.script import main
 from mpmopt.design.one_piece import OnePiece
 from mpmopt.design.task import AtMost, Task
 from mpmopt.design.variation import Variation
-from mpmopt.optimisation.presets import gait, paper_preset
+from mpmopt.optimisation.presets import creep, paper_preset
 from mpmopt.scene import Actuator, Design, Grid, Ground, Material, Mirror, Scene, Wall
 
 
@@ -89,16 +89,16 @@ START = {"phi": np.random.default_rng(1).uniform(-0.05, 0.05, 408), "omega": 0.5
 TASK = Task(
     subject_to=(AtMost(OnePiece(), -0.4),),
     scenes=(
-        Variation(friction=0.28, strength=0.9, threshold=0.4),
+        Variation(friction=0.28, strength=0.9),
         Variation(friction=0.45),
-        Variation(friction=0.72, strength=1.1, threshold=0.6),
+        Variation(friction=0.72, strength=1.1),
     ),
     soft_minimum=8.0,
 )
 
 CASES = {
-    "default": Case(crawler_on_ground(64, 1e-3, 4.0), gait(1e-3, 120), slanted_legs, START, TASK),
-    "preview": Case(crawler_on_ground(64, 1e-3, 3.0), gait(1e-3, 40), slanted_legs, START, TASK),
+    "default": Case(crawler_on_ground(64, 1e-3, 4.0), creep(1e-3, 25), slanted_legs, START, TASK),
+    "preview": Case(crawler_on_ground(64, 1e-3, 3.0), creep(1e-3, 15), slanted_legs, START, TASK),
     "paper": Case(crawler(128, 2e-4), paper_preset(2e-4), slanted_legs),
 }
 

@@ -51,6 +51,20 @@ def gait(time_step: float, most_iterations: int) -> Settings:
     )
 
 
+def creep(time_step: float, most_iterations: int) -> Settings:
+    """Beta doubled from 4 to 32, from a grey block, for bodies that walls bear on both sides.
+
+    Moves are shortened after a step that went back. At 16 and 32 designs are judged solid too.
+    """
+    return Settings(
+        tuple(
+            Stage(2.0**k, 2e-3, 2e-4, time_step, solid=k >= 4, move_limit=0.1) for k in range(2, 6)
+        ),
+        sharpen_asymptotes=False,
+        most_iterations=most_iterations,
+    )
+
+
 def paper_preset(time_step: float) -> Settings:
     """The paper's: beta doubled from 0.5 to 16, both floors 1e-3, moving asymptotes as published.
 
