@@ -31,7 +31,7 @@ def blocks(page: str) -> list[str]:
 
 
 def few(time_step: float, most_iterations: int) -> Settings:
-    """One stage of few evaluations, instead of a gait's."""
+    """One stage of few evaluations, instead of a preset's."""
     return Settings((Stage(2.0, 1e-2, 1e-3, time_step, move_limit=0.1),), most_iterations=4)
 
 
@@ -41,7 +41,8 @@ def run_page(monkeypatch, tmp_path):
     coarse: Any = ModuleType("robot")
     coarse.worm = replace(worm, grid=Grid((64, 16), 1 / 32), time_step=2e-3, steps=500)
     monkeypatch.setitem(sys.modules, "robot", coarse)
-    monkeypatch.setattr(presets, "gait", few)
+    for name in ("continuation", "creep"):
+        monkeypatch.setattr(presets, name, few)
     monkeypatch.chdir(tmp_path)
 
     def run(page: str) -> dict[str, Any]:
