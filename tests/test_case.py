@@ -255,12 +255,14 @@ def test_the_number_of_evaluations_is_known_from_the_stages(short_run):
 def test_the_walkers_settings_are_those_of_the_design():
     preview, default, paper = (CASES[name] for name in ("preview", "default", "paper"))
     for case in (preview, default):
-        assert (case.scene.grid.dx, case.scene.time_step) == (1 / 64, 8e-4)
+        assert (case.scene.grid.dx, case.scene.time_step) == (1 / 64, 1e-3)
         assert not case.scene.walls
         assert case.scene.ground
-        assert case.task == IN_ONE_PIECE
+        assert case.task.subject_to == IN_ONE_PIECE.subject_to
+        assert len(case.task.scenes) == 3
+        assert case.scene.formulation == "total"
         floors = {(s.void_density, s.void_stiffness) for s in case.settings.stages}
-        assert floors == {(1e-2, 1e-3)}
+        assert floors == {(2e-3, 2e-4)}
     assert default.scene.steps > preview.scene.steps
     assert not paper.scene.ground
     assert (paper.scene, paper.task) == (walker(128, 2e-4), Task())

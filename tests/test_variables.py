@@ -223,7 +223,7 @@ def test_an_optimisation_keeps_what_is_restricted_and_goes_on_to_the_bit(tmp_pat
         again = go_on(runfile.read_run(path).run)
         assert again.last is not None
         assert np.array_equal(again.last.x, whole.last.x)
-    summary = summarise(whole, {})
+    summary = summarise(whole)
     assert len(summary["angular_frequency"]) == 2
     assert summary["variables"][0] == "theta[1] = theta[0]"
     assert "omega[1] from -1 to 0.5" in table(summary)

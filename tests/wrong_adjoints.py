@@ -65,7 +65,7 @@ GROUND_FAULTS = {
         "node_bar[node, 3] = push_bar * parameters.dt * per_m",
         "node_bar[node, 3] = 0.0 * push_bar",
     ),
-    "friction through the mass": ("-= push_bar * push * per_m", "-= 0.0 * push_bar"),
+    "friction through the mass": ("2] -= push_bar * push * per_m", "2] -= 0.0 * push_bar"),
     "slope of the layer": ("-b_bar * capacity / thickness, b_bar", "0.0 * b_bar, b_bar"),
     "stiffness of the layer": ("stiffness * volume * capacity_bar)", "volume * capacity_bar)"),
 }
@@ -125,7 +125,7 @@ def main() -> None:
         return lambda *args: tuple(1.001 * bar for bar in function(*args))
 
     for name, module, attribute, wrong in (
-        ("projection", chain, "project_adjoint", lambda phi, beta, bar: bar * 0.5),
+        ("projection", chain, "project_adjoint", lambda phi, beta, bar, threshold: bar * 0.5),
         (
             "phase",
             actuation,
