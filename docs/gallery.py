@@ -41,13 +41,13 @@ CASES = {
 }
 SECONDS = 5.0  # of a film
 ROWS = {
-    "start": "Start, grey all over",
+    "start": "Start",
     "reference": "Solid reference design",
     "baseline": "Baseline design",
     "optimised": "Optimised",
     "post_processed": "Post-processed",
     "actuation_off": "The same with its actuation off",
-    "retained_gain": "Gain retained with half the step; twice the step; finer cells",
+    "retained_gain": "Gain retained: half, twice the step; finer cells; other formulation",
     "disconnected_particles": "Disconnected particles",
     "evaluations": "Evaluations",
     "failed_evaluations": "Failed evaluations",

@@ -8,10 +8,10 @@ from conftest import small_scene, worst
 from walker import slanted_legs, walker
 
 from mpmopt import kernels
-from mpmopt.assess.threshold import post_processed
+from mpmopt.assess.threshold import SOLID_LIMITS, post_processed
 from mpmopt.assess.verify import COMPLEX_STEP, COMPLEX_TOLERANCE, complex_step_test
 from mpmopt.design.problem import Problem
-from mpmopt.design.step_control import LIMITS
+from mpmopt.design.step_control import LIMITS, check_indicators
 from mpmopt.errors import DesignError, FractureError, SimulationError
 from mpmopt.optimisation.loop import optimise
 from mpmopt.optimisation.settings import Settings, Stage
@@ -221,9 +221,9 @@ def test_what_no_step_cures_is_an_error():
         m.courant < LIMITS.courant and m.velocity_increment < LIMITS.velocity_increment
         for m in reached
     )
-    with pytest.raises(SimulationError, match=rf"1 / J .* the limit is 100; .* \(now {dt / 4:g}\)"):
+    with pytest.raises(SimulationError, match=rf"J of a .* stay above 0.01; .* \(now {dt / 4:g}\)"):
         problem.value(x)
-    with pytest.raises(SimulationError, match="1 / J"):
+    with pytest.raises(SimulationError, match="J of a particle"):
         problem.evaluate(x)
 
 
@@ -298,3 +298,11 @@ def test_a_senseless_number_of_attempts_is_refused(wrong):
         Problem(small_scene(), halvings=wrong)
     with pytest.raises(DesignError, match="halvings"):
         Stage(1.0, 1e-2, 1e-3, 1e-3, halvings=wrong)
+
+
+@pytest.mark.parametrize("J", [0.0, -0.5])
+def test_solid_that_is_turned_inside_out_never_counts(J):
+    simulation = Problem(small_scene(steps=2)).simulation(np.zeros(Problem(small_scene()).size))
+    for limits in (LIMITS, SOLID_LIMITS):
+        with pytest.raises(SimulationError, match="J of a particle fell to"):
+            check_indicators(Indicators(jacobian=J), simulation, limits)

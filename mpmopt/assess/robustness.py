@@ -282,7 +282,7 @@ def follow(robot: Robot, scene: Scene) -> Followed:
     seen = np.flatnonzero((time >= SETTLED) & (time <= SEEN))
     first, last = (seen[0], seen[-1]) if seen.size > 1 else (0, -1)
     mean = max(float(way[last] - way[first]) / float(np.ptp(time[[first, last]]) or 1.0), 0.0)
-    pause = round(PAUSE / (every * scene.time_step))
+    pause = max(1, round(PAUSE / (every * scene.time_step)))
     slow = way[pause:] - way[: len(way) - pause] <= SLOW * mean * PAUSE
     events = [(float(time[fallen.argmax()]), "falls")] if fallen.any() else []
     late = np.flatnonzero(slow & (time[: len(slow)] >= SETTLED))

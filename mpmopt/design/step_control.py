@@ -65,15 +65,16 @@ def check_indicators(indicators: Indicators, simulation: Simulation, limits: Ind
         If the step is too long; a `FractureError` if solid is fractured and an `OverlapError` if
         parts of it lie in each other, which no step mends.
     """
-    flattest = 1.0 / limits.jacobian if limits.jacobian > 0.0 else math.inf
     for what, value, limit in (
         ("the Courant number of a stretched particle", indicators.courant, limits.courant),
         ("dt |C| of a particle", indicators.velocity_increment, limits.velocity_increment),
-        ("1 / J of a particle", 1.0 / indicators.jacobian, flattest),
         ("energy that appears from nowhere", indicators.energy, limits.energy),
     ):
         if not value <= limit:
             raise too_long(simulation, f"{what} reached {value:.3g}, the limit is {limit:.3g}")
+    if not indicators.jacobian > limits.jacobian:
+        least = f"J of a particle fell to {indicators.jacobian:.3g}, it must stay above"
+        raise too_long(simulation, f"{least} {limits.jacobian:.3g}")
     per_cell = simulation.scene.particles_per_cell
     limit = limits.stretch * per_cell
     if not indicators.stretch <= limit:

@@ -168,7 +168,8 @@ class Tied(Restriction):
     to : int
         The entry that they follow, which follows none itself.
     factor, shift : float
-        Not zero, and any. Where they would lead beyond bounds, the range of `to` is less.
+        Within [-1, 1], the factor not zero. Where they would lead beyond bounds, the range of `to`
+        is less.
     """
 
     to: int = 0

@@ -364,8 +364,6 @@ class _Ascent:
                 refined = self._without_void(refinement.least, problem.at(time_step), x)
                 refined = -np.inf if np.isnan(refined) else refined
         before = run.last.x if run.last else x
-        if before.size != x.size:  # another grid
-            before = x
         slope, free = self.freedom.pullback(gradients[0]), self.freedom.reduced(x)
         movable = np.where(slope > 0.0, free < self.freedom.upper, free > self.freedom.lower)
         gamma = self.problem.gamma(x)
