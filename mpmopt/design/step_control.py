@@ -72,9 +72,9 @@ def check_indicators(indicators: Indicators, simulation: Simulation, limits: Ind
     ):
         if not value <= limit:
             raise too_long(simulation, f"{what} reached {value:.3g}, the limit is {limit:.3g}")
-    if not indicators.jacobian > limits.jacobian:
-        least = f"J of a particle fell to {indicators.jacobian:.3g}, it must stay above"
-        raise too_long(simulation, f"{least} {limits.jacobian:.3g}")
+    if not indicators.jacobian >= limits.jacobian or indicators.jacobian <= 0.0:
+        fell = f"J of a particle fell to {indicators.jacobian:.3g}"
+        raise too_long(simulation, f"{fell}, it must stay above {limits.jacobian:.3g}")
     per_cell = simulation.scene.particles_per_cell
     limit = limits.stretch * per_cell
     if not indicators.stretch <= limit:
