@@ -103,8 +103,10 @@ def _width(piece: Any, detail: float) -> float:
 
 def _has(piece: Any, width: float, detail: float) -> bool:
     """Whether a piece is so wide."""
-    left = piece.offset(-0.5 * width, circular_segments=SEGMENTS)
+    # All arguments, since older manifold3d has no default for the second.
+    rounded = import_module("manifold3d").JoinType.Round, 2.0, SEGMENTS
+    left = piece.offset(-0.5 * width, *rounded)
     if len(left.decompose()) != 1 or left.num_contour() != piece.num_contour():
         return False
-    lost = piece - left.offset(0.5 * GROWN * width, circular_segments=SEGMENTS)
+    lost = piece - left.offset(0.5 * GROWN * width, *rounded)
     return max((part.area() for part in lost.decompose()), default=0.0) <= width**2 + detail**2
