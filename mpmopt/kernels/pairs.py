@@ -352,6 +352,17 @@ def renewed(near: Any, nodes: NDArray, touch: Any) -> tuple[Near, float]:
     return near, room
 
 
+@jit
+def way_between(pairs, n, place, touch):
+    """The particles of a pair, whether the second is there as its image, and the way from there."""
+    a, b = pairs[n, 0], pairs[n, 1] % touch.grip.size
+    image = pairs[n, 1] != b
+    x, y = place[b, 0], place[b, 1]
+    if image:
+        x, y = imaged(x, y, touch)
+    return a, b, image, place[a, 0] - x, place[a, 1] - y
+
+
 @loop_jit
 def push_apart(near: Any, nodes: NDArray, touch: Any, force: NDArray) -> None:
     """Adds the pairs' forces to the first two rows of the nodes' `force` (., M)."""
@@ -363,12 +374,7 @@ def push_apart(near: Any, nodes: NDArray, touch: Any, force: NDArray) -> None:
         for k in range(size):
             place[c * size + k, 0], place[c * size + k, 1] = position(nodes, touch, c, k)
     for n in range(len(near.pairs)):
-        a, b = near.pairs[n, 0], near.pairs[n, 1] % count
-        image = near.pairs[n, 1] != b
-        x, y = place[b, 0], place[b, 1]
-        if image:
-            x, y = imaged(x, y, touch)
-        dx, dy = place[a, 0] - x, place[a, 1] - y
+        a, b, image, dx, dy = way_between(near.pairs, n, place, touch)
         square = dx * dx + dy * dy
         if 0.0 < square.real < reach * reach:
             f = grip[a] * grip[b] * (reach / np.sqrt(square) - 1.0)
@@ -419,12 +425,7 @@ def push_apart_adjoint(
             place[p, 0], place[p, 1] = position(nodes, touch, c, k)
             pushes_bar[p, 0], pushes_bar[p, 1] = position(force_bar, touch, c, k)
     for n in range(len(near.pairs)):
-        a, b = near.pairs[n, 0], near.pairs[n, 1] % count
-        image = near.pairs[n, 1] != b
-        x, y = place[b, 0], place[b, 1]
-        if image:
-            x, y = imaged(x, y, touch)
-        dx, dy = place[a, 0] - x, place[a, 1] - y
+        a, b, image, dx, dy = way_between(near.pairs, n, place, touch)
         square = dx * dx + dy * dy
         if 0.0 < square.real < reach * reach:
             r = np.sqrt(square)
