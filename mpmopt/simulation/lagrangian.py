@@ -318,11 +318,9 @@ class LagrangianSimulation(Simulation):
         f00, f01, f10, f11 = F
         J, trace = f00 * f11 - f01 * f10, f00**2 + f01**2 + f10**2 + f11**2
         s2 = 0.5 * (trace + np.sqrt(np.maximum(trace**2 - 4.0 * J**2, 0.0)))
-        inside = np.maximum(J, lagrangian.LEAST_J)
-        slope = 1.0 / inside - (J - inside) / inside**2
-        log = np.log(inside) + (J - inside) / inside - 0.5 * ((J - inside) / inside) ** 2
+        log, slope, bend = kernels.plain(lagrangian.continued)(J)
         lam, mu, eta = self.data.constants[:, self._solid]
-        hardening = lam * slope**2 - (lam * log - mu) / inside**2
+        hardening = lam * slope**2 + (lam * log - mu) * bend
         stiffness = mu + np.maximum(hardening, 0.0) * s2
         stiffness_share, volume, mass = (
             each[self._solid].real
