@@ -24,11 +24,11 @@ from mpmopt.assess.robustness import (
     refined,
     speed,
     whole_periods,
-    with_actuators,
-    with_friction,
+    with_frequency,
 )
 from mpmopt.assess.threshold import kept
 from mpmopt.design.problem import Problem
+from mpmopt.design.variation import Variation
 from mpmopt.errors import DesignError, SceneError, SimulationError
 from mpmopt.kernels import parts
 from mpmopt.optimisation.loop import optimise
@@ -137,8 +137,8 @@ def test_scenes_are_what_their_names_say():
         scene, material=dataclasses.replace(scene.material, viscosity=0.1)
     )
     assert refined(viscous, 4.0).time_step == 5e-4  # a quarter would be too long there
-    assert [ground.friction for ground in with_friction(scene, 0.7).ground] == [0.7]
-    strong = with_actuators(scene, strength=1.2, frequency=0.8).actuators
+    assert [ground.friction for ground in Variation(friction=0.7).scene(scene).ground] == [0.7]
+    strong = with_frequency(Variation(strength=1.2).scene(scene), 0.8).actuators
     assert strong[0].stress == ((2.4, 0.6), (0.6, 1.2))
     assert [each.angular_frequency for each in strong] == [24.0, 40.0]
     assert robot_in(scene).period(scene) == pytest.approx(2 * np.pi / 30.0)

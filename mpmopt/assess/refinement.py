@@ -83,9 +83,13 @@ def variants(scene: Scene) -> dict[str, Callable[[], Scene]]:
         "cells half as wide": lambda: refined(scene, 2),
     }
     if not scene.walls and not scene.clamps:  # which one of the formulations does not know
-        formulation: Formulation = "updated" if scene.formulation == "total" else "total"
-        others["other formulation"] = lambda: replace(scene, formulation=formulation)
+        others["other formulation"] = lambda: replace(scene, formulation=other_formulation(scene))
     return others
+
+
+def other_formulation(scene: Scene) -> Formulation:
+    """The one that the scene is not in."""
+    return "updated" if scene.formulation == "total" else "total"
 
 
 def study(

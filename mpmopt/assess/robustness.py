@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import label
 
 from mpmopt.assess import threshold
+from mpmopt.assess.refinement import other_formulation
 from mpmopt.assess.threshold import SOLID_LIMITS, solid_body
 from mpmopt.design.actuation import frequencies
 from mpmopt.design.ensemble import side_by_side
@@ -23,9 +24,10 @@ from mpmopt.design.objective import Objective
 from mpmopt.design.problem import Problem
 from mpmopt.design.step_control import check_indicators
 from mpmopt.design.variables import Variables
+from mpmopt.design.variation import Variation
 from mpmopt.errors import SceneError, SimulationError
 from mpmopt.kernels import parts
-from mpmopt.scene import Grid, Scene
+from mpmopt.scene import Actuator, Grid, Scene
 from mpmopt.scene.particles import Particles, discretise, mirror_images, nearest_designed
 from mpmopt.scene.scene import LAGRANGIAN_LIMIT, Formulation
 from mpmopt.simulation.simulation import Simulation
@@ -174,27 +176,15 @@ def refined(scene: Scene, multiple: float = 1.0, formulation: Formulation | None
     )
 
 
-def other_formulation(scene: Scene) -> Formulation:
-    """The one that the scene is not in."""
-    return "updated" if scene.formulation == "total" else "total"
-
-
-def with_friction(scene: Scene, friction: float) -> Scene:
-    """The scene on ground of another friction."""
-    return replace(scene, ground=tuple(replace(each, friction=friction) for each in scene.ground))
-
-
-def with_actuators(scene: Scene, strength: float = 1.0, frequency: float = 1.0) -> Scene:
-    """The scene with actuators so many times as strong and as fast."""
-    body = []
-    for region in scene.body:
-        if region in scene.actuators:
-            actuator: Any = region
-            stress = tuple(tuple(strength * s for s in row) for row in actuator.stress)
-            omega = frequency * actuator.angular_frequency
-            region = replace(actuator, stress=stress, angular_frequency=omega)
-        body.append(region)
-    return replace(scene, body=tuple(body))
+def with_frequency(scene: Scene, share: float) -> Scene:
+    """The scene with actuators so many times as fast."""
+    body = tuple(
+        replace(region, angular_frequency=share * region.angular_frequency)
+        if isinstance(region, Actuator)
+        else region
+        for region in scene.body
+    )
+    return replace(scene, body=body)
 
 
 class Trial(NamedTuple):
@@ -442,13 +432,13 @@ def _trials(scene: Scene, full: bool) -> dict[str, Trial]:
         return Trial(lambda: replace(scene, time_step=multiple * scene.time_step))
 
     def friction(value: float) -> Trial:
-        return Trial(lambda: with_friction(scene, value))
+        return Trial(lambda: Variation(friction=value).scene(scene))
 
     def strength(value: float) -> Trial:
-        return Trial(lambda: with_actuators(scene, strength=value))
+        return Trial(lambda: Variation(strength=value).scene(scene))
 
     def frequency(value: float) -> Trial:
-        return Trial(lambda: with_actuators(scene, frequency=value))
+        return Trial(lambda: with_frequency(scene, value))
 
     trials: dict[str, Trial] = {}
     if full:
