@@ -25,7 +25,7 @@ from robots import worst
 from mpmopt.app.case import Case
 from mpmopt.app.multistart import multistart
 from mpmopt.app.sweeps import as_csv
-from mpmopt.assess.robustness import Robot
+from mpmopt.assess.robustness import Robot, can_be_studied
 from mpmopt.assess.trajectory import Motion
 from mpmopt.io.console import reported
 from mpmopt.io.files import replace_file
@@ -132,6 +132,8 @@ def main(argv: list[str] | None = None) -> int:
     options = parser.parse_args(argv)
     if options.setting not in CASES[options.robot]:
         parser.error(f"--setting {options.setting}: one of {', '.join(CASES[options.robot])}")
+    if not can_be_studied(CASES[options.robot][options.setting].scene):
+        parser.error(f"--setting {options.setting}: its robot has no speed, for it is on walls")
     return reported(
         lambda: print(compare(options.robot, options.setting, options.starts, options.out)),
         lambda: "The same command goes on.",
