@@ -26,6 +26,7 @@ from pathlib import Path
 import numpy as np
 from walker import walker, walker_on_ground
 
+from mpmopt.design.ensemble import side_by_side
 from mpmopt.design.objective import Objective
 from mpmopt.design.problem import Problem
 from mpmopt.simulation.checkpoints import Checkpointing
@@ -121,28 +122,70 @@ def threads_and_schedules(steps: int, rounds: int) -> str:
     return table(f"The paper's walker, {steps} steps, by threads and schedule", header, rows)
 
 
+def on_ground(cells: int, steps: int, formulation: str = "total") -> tuple[Simulation, Objective]:
+    """The walker on ground, with its layer and viscosity."""
+    scene = walker_on_ground(cells, 2e-4 * 128 / cells, 4.0)
+    problem = Problem(replace(scene, steps=steps, transient=0.0, formulation=formulation))
+    phi = np.random.default_rng(0).uniform(-0.5, 0.5, int(problem.particles.designed.sum()))
+    simulation = problem.simulation(problem.join(phi, 1.0, -0.3, -0.5))
+    return simulation, Objective.of(problem.scene, simulation.particles)
+
+
+def several(scenes: int, simulation: Simulation, objective: Objective) -> Run:
+    """So many gradients side by side, each by one thread."""
+    run = partial(gradient_of, simulation, objective, KEEP_ALL)
+    return with_threads(1, lambda: side_by_side(lambda _: run(), range(scenes)))
+
+
 def formulations(steps: int, rounds: int) -> str:
     """The walker on ground, viscous, in both formulations, by one thread."""
-    scene = replace(walker_on_ground(128, 2e-4, 4.0), steps=steps, transient=0.0)
     runs: dict[str, Run] = {}
     for kind in ("updated", "total"):
-        problem = Problem(replace(scene, formulation=kind))
-        phi = np.random.default_rng(0).uniform(-0.5, 0.5, int(problem.particles.designed.sum()))
-        simulation = problem.simulation(problem.join(phi, 1.0, -0.3, -0.5))
-        objective = Objective.of(scene, simulation.particles)
+        simulation, objective = on_ground(128, steps, kind)
         count = simulation.initial.shape[1]
         runs[f"forward {kind}"] = with_threads(1, simulation.run)
-        runs[f"both {kind}"] = with_threads(
-            1, partial(gradient_of, simulation, objective, KEEP_ALL)
-        )
+        runs[f"both {kind}"] = several(1, simulation, objective)
+        runs[f"two {kind}"] = several(2, simulation, objective)
     seconds = in_turns(runs, rounds)
     rows = []
-    for what, name in (("forward", "forward"), ("both", "value + gradient, states kept")):
+    for what, number, name in (
+        ("forward", 1, "forward"),
+        ("both", 1, "value + gradient"),
+        ("two", 2, "value + gradient, two scenes side by side, each of both"),
+    ):
         updated, total = seconds[f"{what} updated"], seconds[f"{what} total"]
-        per = [f"{np.median(each) / (steps * count) * 1e9:.1f}" for each in (updated, total)]
-        rows.append([name, *per, f"{ratio(total, updated):.2f}"])
+        per = [np.median(each) / (number * steps * count) * 1e9 for each in (updated, total)]
+        rows.append([name, *(f"{each:.1f}" for each in per), f"{ratio(total, updated):.2f}"])
+    rows.append(
+        [
+            "two scenes take as long as one, times",
+            *(f"{ratio(seconds[f'two {k}'], seconds[f'both {k}']):.2f}" for k in ("updated", "total")),
+            "",
+        ]
+    )
     header = ["ns per particle and step", "MLS-MPM", "total Lagrangian", "ratio"]
-    return table(f"The walker on ground, {count} particles, by formulation", header, rows)
+    title = f"The walker on ground, {count} particles, {steps} steps, states kept, one thread a scene"
+    return table(title, header, rows)
+
+
+def sizes_on_ground(quick: bool, rounds: int) -> str:
+    """Total Lagrangian: cost per particle from hundreds to a quarter of a million."""
+    rows: list[list[str]] = []
+    costs = []
+    for cells, steps in ((64, 2000), (128, 1000), (256, 400), (512, 100))[: 2 if quick else 4]:
+        simulation, objective = on_ground(cells, steps)
+        count = simulation.initial.shape[1]
+        seconds = in_turns(
+            {"forward": with_threads(1, simulation.run), "both": several(1, simulation, objective)},
+            rounds,
+        )
+        per = 1e9 / (count * steps)
+        cost = [float(np.median(seconds[name])) * per for name in ("forward", "both")]
+        costs.append(cost)
+        times = [f"{mine / first:.2f}" for mine, first in zip(cost, costs[0])]
+        rows.append([f"{count}", f"{cost[0]:.1f}", times[0], f"{cost[1]:.1f}", times[1]])
+    header = ["particles", "forward ns", "times the first", "value + gradient ns", "times the first"]
+    return table("Total Lagrangian, the walker on ground, by size, one thread", header, rows)
 
 
 def sizes(quick: bool, rounds: int) -> str:
