@@ -58,6 +58,9 @@ class Stage:
     limited : bool
         Whether an evaluation that goes beyond `step_control.LIMITS` is rejected too, or only one
         that fails.
+    subpixel : bool
+        Whether edges of the design are as wide as a particle, and the rest is black and white,
+        whatever beta is (`projection.project_subpixel`).
 
     Raises
     ------
@@ -76,6 +79,7 @@ class Stage:
     most_iterations: int | None = None
     halvings: int = 2
     limited: bool = True
+    subpixel: bool = False
 
     def __post_init__(self) -> None:
         _take(self, number, "beta void_density void_stiffness time_step move_limit", above=0.0)
@@ -83,7 +87,7 @@ class Stage:
             if getattr(self, name) > 1.0:
                 raise DesignError(f"Stage: {name} = {getattr(self, name)} must be at most 1")
         _take(self, share, "void_cutoff")
-        _take(self, flag, "solid refined limited")
+        _take(self, flag, "solid refined limited subpixel")
         if self.refined and not self.solid:
             raise DesignError("Stage: refined = True needs solid = True")
         _take(self, count, "most_iterations", least=1)
@@ -114,6 +118,7 @@ class Stage:
             self.halvings,
             LIMITS if self.limited else None,
             task=task,
+            subpixel=self.subpixel,
         )
 
 
