@@ -46,6 +46,7 @@ def gait(time_step: float, most_iterations: int) -> Settings:
         (Stage(100.0, 2e-3, 2e-4, time_step, solid=True, move_limit=0.02, subpixel=True),),
         adapt_move_limit=False,
         sharpen_asymptotes=False,
+        asymptote_min=0.01,
         tolerance=0.0,
         most_iterations=most_iterations,
     )
