@@ -115,8 +115,7 @@ def study(
     -------
     list of Variant
         First as it was designed, then with half the step, twice the step, cells half as wide, and
-        in the other formulation where the scene has no walls. What cannot be
-        simulated says why.
+        in the other formulation where the scene has no walls. What cannot be simulated says why.
 
     Raises
     ------

@@ -680,7 +680,7 @@ def move_adjoint(old, new, force, per_mass, lattice, state_bar, force_bar, bar):
             put_four(force, i, u)
             put_four(force, M + i, v)
             for k in range(i, i + 4):
-                if force[2, k] * per_mass[k] > 0.0:  # what is held resists nothing
+                if force[2, k] * per_mass[k] > 0.0:  # but for what is held
                     resist_adjoint(k, old, force, per_mass, lattice, state_bar, force_bar, bar)
             u, v = four(force, i), four(force, M + i)
             u_bar, v_bar = four(state_bar, 2 * M + i), four(state_bar, 3 * M + i)
