@@ -588,7 +588,7 @@ def fold(fields, lattice):
 
 @jit
 def steps_per_mass(lattice):
-    """dt / m of the nodes (M,), and zero where they have no mass or are held: nothing moves them."""
+    """dt / m of the nodes (M,), and zero where they have no mass, or forces cannot move them."""
     per_mass = np.zeros_like(lattice.mass)
     for i in range(len(per_mass)):
         if lattice.mass[i].real > 0.0:
