@@ -155,7 +155,7 @@ def plausible(draw: Any) -> dict[str, Any]:
     clamps = []
     if draw(st.integers(0, 3)) == 0:
         clamps = [draw(clamp(dx, time_step, mirrored))]
-    total = not (walls or clamps) and draw(st.booleans())
+    total = not walls and draw(st.booleans())
     time_step *= 0.7 if total else 1.0
     return {
         "grid": {"cells": list(cells), "dx": dx},

@@ -19,10 +19,11 @@ from mpmopt.kernels.lagrangian import LEAST_J
 from mpmopt.scene import Scene
 from mpmopt.simulation.lagrangian import LagrangianSimulation
 from mpmopt.simulation.simulation import Simulation
+from mpmopt.simulation.surroundings import holders
 
 # What a state has, and what it is given (less than zero: what is taken from it).
 ENERGIES = ("kinetic", "elastic", "gravity", "layer")
-WORKS = ("actuation", "viscosity", "friction", "damping", "walls", "transfer")
+WORKS = ("actuation", "viscosity", "friction", "damping", "walls", "clamps", "transfer")
 Array = NDArray[np.float64]
 
 
@@ -39,15 +40,15 @@ class Books:
         layers store.
     work : dict of str to (S + 1,) array
         What was done so far, by whom: actuation, viscosity, friction and damping of grounds, walls
-        in all, and transfer between particles and nodes, of which no body knows; the formulation
-        "total" has neither of the last two.
+        in all, clamps in all, and transfer between particles and nodes, of which no body knows; the
+        formulation "total" has no walls and no transfer.
     supports : tuple of str
-        The scene's grounds in their order, and its walls as one.
+        The scene's grounds in their order, its walls as one, and its clamps in their order.
     force : (S, P, 2) array
         Of each of P supports on the body, mean of a step.
     place : (S, P, 2) array
-        Where it acts: the mean place of a ground's normal force, and of what walls do; not a number
-        where there is none.
+        Where it acts: the mean place of a ground's normal force, and of what walls and clamps do;
+        not a number where there is none.
     weight : float
     travel : float
         Of the centre of mass, along the scene's direction.
@@ -171,6 +172,7 @@ def books(simulation: Simulation, progress: Callable[[], None] | None = None) ->
     steps, scene = simulation.steps, simulation.scene
     supports = tuple(f"ground {k}" for k in range(len(scene.layers)))
     supports += ("walls",) * bool(scene.walls)
+    supports += tuple(f"clamp {k}" for k in range(len(scene.clamps)))
     energies, works = np.empty((steps + 1, len(ENERGIES))), np.zeros((steps + 1, len(WORKS)))
     force, place = np.empty((2, steps, len(supports), 2))
     states = account.states()
@@ -329,7 +331,7 @@ class _Account:
         q = N.T @ (self.mass * v).T + Nx.T @ affine[:, 0].T + Ny.T @ affine[:, 1].T
         added = N.T @ (dt * push).T + Nx.T @ A[:, 0].T + Ny.T @ A[:, 1].T
 
-        # Velocities of nodes: as they were, after forces, after grounds, after walls.
+        # Velocities of nodes: as they were, after forces, after grounds, after walls and clamps.
         u_old = q * per_m[:, None]
         grid = np.column_stack([q + added, m, N.T @ borne.sum(axis=0)])
         u_free = (q + added) * per_m[:, None] + dt * there[:, None] * self.scene.gravity
@@ -340,15 +342,17 @@ class _Account:
         u_ground, u = after.reshape(2, -1, 2)
         u_mean = 0.5 * (u_old + u)
 
-        # Impulses of grounds and walls, whose work is that on the mean velocity.
-        held = grid[:, 3] > 0.0
-        impulse = (held * m)[:, None] * (u_ground - u_free)
+        # Impulses of grounds, walls and clamps, whose work is that on the mean velocity.
+        holder = holders(self.nodes, clamps)
+        slowed = (grid[:, 3] > 0.0) & (holder < 0)
+        impulse = (slowed * m)[:, None] * (u_ground - u_free)
         resisting = (impulse * self.normal.T).sum(axis=1)[:, None] * self.normal.T
         stopping = m[:, None] * (u - u_free) - impulse
         stopping[np.abs(stopping) <= 1e-13 * m[:, None] * np.abs(u_free).max()] = 0.0  # rounding
         damping = float((resisting * u_mean).sum())
         friction = float(((impulse - resisting) * u_mean).sum())
-        walls = float((stopping * u_mean).sum())
+        given = (stopping * u_mean).sum(axis=1)
+        walls, clamped = float(given[holder < 0].sum()), float(given[holder >= 0].sum())
 
         # Grid to particles, which take up less than nodes give, in motion, F and x.
         v_mean = (N @ u_mean).T
@@ -360,8 +364,8 @@ class _Account:
         transfer = kept - self._motion(v, C) + self._motion(v_new, C_new)
         transfer += float((self.volume * tau * (strain - dt * C_mean)).sum())
         transfer += float((push * (dt * v_mean - moved)).sum())
-        works = (-dissipated, friction, damping, walls, transfer)
-        return works, *self._supports(x, borne, normal, impulse, stopping)
+        works = (-dissipated, friction, damping, walls, clamped, transfer)
+        return works, *self._supports(x, borne, normal, impulse, stopping, holder)
 
     def _interpolation(self, x: Array) -> tuple[sparse.csr_array, ...]:
         """Weights (N, M) of nodes at particles, and times how far nodes are along x and y."""
@@ -381,17 +385,24 @@ class _Account:
         return tuple(found)
 
     def _supports(
-        self, x: Array, borne: Array, normal: Array, impulse: Array, stopping: Array
+        self,
+        x: Array,
+        borne: Array,
+        normal: Array,
+        impulse: Array,
+        stopping: Array,
+        holder: NDArray[np.int64],
     ) -> tuple[Array, Array]:
-        """Force and place (P, 2) of every support."""
+        """Force and place (P, 2) of every support; what stops nodes is its holder, -1 the walls."""
         dt, forces, places = self.scene.time_step, [], []
         for k, b in enumerate(borne):
             own = impulse[self.ground == k].sum(axis=0)
             forces.append(normal[k] @ b + own / dt)
             places.append(_mean(x, b))
-        if self.scene.walls:
-            forces.append(stopping.sum(axis=0) / dt)
-            places.append(_mean(self.nodes, np.hypot(*stopping.T)))
+        for k in range(-1 if self.scene.walls else 0, len(self.scene.clamps)):
+            own = stopping * (holder == k)[:, None]
+            forces.append(own.sum(axis=0) / dt)
+            places.append(_mean(self.nodes, np.hypot(*own.T)))
         return np.reshape(forces, (-1, 2)), np.reshape(places, (-1, 2))
 
 
@@ -416,6 +427,8 @@ class _LatticeAccount(_Account):
         self._m = m * shares.ravel()
         if self.scene.mirror is not None:
             self._m = np.tile(self._m, 2)
+        self._holder = np.full(len(m), -1)
+        self._holder[lattice.held] = lattice.holder
 
     @property
     def _lines(self) -> tuple[int, int]:
@@ -478,7 +491,7 @@ class _LatticeAccount(_Account):
         viscous = eta * 0.5 * _product(F, E + E.transpose(1, 0, 2))
         dissipated = float((self.volume * viscous * (F_new - F_old)).sum())
 
-        # Velocities of nodes without friction and damping.
+        # Velocities of nodes without friction, damping and clamps.
         borne, normal = self._bearing(x)
         push = (borne[:, None] * normal).sum(axis=0)
         count = half.shape[1]
@@ -491,20 +504,25 @@ class _LatticeAccount(_Account):
         force = self._folded(force.T)
         free = old[2:] + dt * (force[:2] * self._per_m + np.reshape(self.scene.gravity, (2, 1)))
         taken = old.copy()
-        taken[2:] = np.where((force[2] > 0.0) & (self._per_m > 0.0), new[2:] - free, 0.0)
+        touched = (force[2] > 0.0) | (self._holder >= 0)
+        taken[2:] = np.where(touched & (self._per_m > 0.0), new[2:] - free, 0.0)
 
         places, lost, before, after = (self._nodes(each) for each in (old, taken, old, new))
+        holder = np.resize(self._holder, len(self._m))  # images are in the same clamp
         lines = [layer.line.distance(places[:2]) for layer in self.layers]
         self.ground = np.argmin([d for d, _ in lines], axis=0) if lines else places[0] * 0
         along = np.zeros_like(places[:2])
         for k, (_, each) in enumerate(lines):
             along[:, self.ground == k] = each[:, self.ground == k]
-        impulse, midst = self._m * lost[2:], 0.5 * (before[2:] + after[2:])
+        given, midst = self._m * lost[2:], 0.5 * (before[2:] + after[2:])
+        impulse, stopping = given * (holder < 0), given * (holder >= 0)
         resisting = (impulse * along).sum(axis=0) * along
         damping = float((resisting * midst).sum())
         friction = float((impulse * midst).sum()) - damping
-        forces = self._supports(x, borne, normal, impulse.T, np.zeros((0, 2)))
-        return (-dissipated, friction, damping, 0.0, 0.0), *forces
+        clamped = float((stopping * midst).sum())
+        self.nodes = places[:2]
+        forces = self._supports(x, borne, normal, impulse.T, stopping.T, holder)
+        return (-dissipated, friction, damping, 0.0, clamped, 0.0), *forces
 
     def _first_piola(self, F: Array, viscous: Array, signal: Array) -> Array:
         """V P (2, 2, N): elastic, viscous, and of actuators."""

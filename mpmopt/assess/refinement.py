@@ -82,7 +82,7 @@ def variants(scene: Scene) -> dict[str, Callable[[], Scene]]:
         "twice the step": lambda: scene.vary(time_step=scene.time_step * 2.0),
         "cells half as wide": lambda: refined(scene, 2),
     }
-    if not scene.walls and not scene.clamps:  # which one of the formulations does not know
+    if not scene.walls:  # which one of the formulations does not know
         others["other formulation"] = lambda: replace(scene, formulation=other_formulation(scene))
     return others
 
@@ -115,8 +115,7 @@ def study(
     -------
     list of Variant
         First as it was designed, then with half the step, twice the step, cells half as wide, and
-        in the other formulation where the scene has neither walls nor clamps. What cannot be
-        simulated says why.
+        in the other formulation where the scene has no walls. What cannot be simulated says why.
 
     Raises
     ------

@@ -82,6 +82,9 @@ class Lattice(NamedTuple):
     active: NDArray[np.bool_]  # (V,) whether a record has actuated particles
     actuation_stress: NDArray[np.float64]  # (K, 3) second Piola-Kirchhoff S: xx, xy, yy
     mass: NDArray  # (M,) of the nodes, lumped
+    held: NDArray[np.int64]  # (H,) nodes that clamps hold
+    holder: NDArray[np.int64]  # (H,) which clamp each of them is in
+    clamps: NDArray[np.float64]  # (steps, K, 6) as those of `kernels.arrays.Parameters`
     ground: Any  # `kernels.ground.Ground`
     nodes_y: int  # of the grid that the ground's table is for, and how many along x
     nodes_x: int
@@ -595,12 +598,33 @@ def fold(fields, lattice):
 
 @inner_jit
 def steps_per_mass(lattice):
-    """dt / m of the nodes (M,), and zero where they have no mass."""
+    """dt / m of the nodes (M,), and zero where they have no mass, or forces cannot move them."""
     per_mass = np.zeros_like(lattice.mass)
     for i in range(len(per_mass)):
         if lattice.mass[i].real > 0.0:
             per_mass[i] = lattice.dt / lattice.mass[i]
+    for k in lattice.held:
+        per_mass[k] = 0.0
     return per_mass
+
+
+@bare_loop_jit
+def hold(old, new, n, lattice):
+    """Give held nodes the velocity of their clamps in step n; the fastest of these, squared."""
+    fastest = 0.0
+    for k, clamp in zip(lattice.held, lattice.holder):
+        u, v = lattice.clamps[n, clamp, 4], lattice.clamps[n, clamp, 5]
+        new[0, k], new[1, k] = old[0, k] + lattice.dt * u, old[1, k] + lattice.dt * v
+        new[2, k], new[3, k] = u, v
+        fastest = max(fastest, u * u + v * v)
+    return fastest
+
+
+@bare_loop_jit
+def hold_adjoint(state_bar, lattice):
+    """The transpose of `hold` after that of `move`: velocities of clamps depend on no state."""
+    for k in lattice.held:
+        state_bar[2, k] = state_bar[3, k] = 0.0
 
 
 @bare_loop_jit
@@ -666,7 +690,7 @@ def move_adjoint(old, new, force, per_mass, lattice, state_bar, force_bar, bar):
             put_four(force, i, u)
             put_four(force, M + i, v)
             for k in range(i, i + 4):
-                if force[2, k] > 0.0:
+                if force[2, k] * per_mass[k] > 0.0:  # but for what is held
                     resist_adjoint(k, old, force, per_mass, lattice, state_bar, force_bar, bar)
             u, v = four(force, i), four(force, M + i)
             u_bar, v_bar = four(state_bar, 2 * M + i), four(state_bar, 3 * M + i)
@@ -731,6 +755,7 @@ def advance_lattice(
         if lattice.mirror_axis >= 0:
             fold(force, lattice)
         speed = move(old, new, force, per_mass, lattice)
+        speed = max(speed, hold(old, new, n, lattice))
         if not speed < math.inf:
             return n, first_unsound(new)
         moved += lattice.dt * math.sqrt(speed)
@@ -779,6 +804,7 @@ def advance_lattice_adjoint(
             if lattice.mirror_axis >= 0:
                 fold(force, lattice)
         move_adjoint(old, new, force, per_mass, lattice, state_bar, force_bar, bar)
+        hold_adjoint(state_bar, lattice)
         if lattice.mirror_axis >= 0:
             fold(force_bar, lattice)
         if room < 0.0:

@@ -26,7 +26,9 @@ ROUNDING = 1e-6  # of a cell
 class Clamp(Checked):
     """Rectangle whose nodes, those on its edges too, have the velocity of its path.
 
-    A particle is held to rounding where all of its nodes are: a cell and a half inside.
+    A particle is held to rounding where all of its nodes are: a cell and a half inside. In the
+    formulation "total" nodes are material points in the middles of cells, and those that begin at
+    most half a cell outside are held for good: so is every cell that is in the rectangle.
 
     Parameters
     ----------

@@ -18,6 +18,7 @@ from mpmopt.simulation.checkpoints import Checkpointing, Checkpoints, Schedule
 from mpmopt.simulation.energy import LOOK
 from mpmopt.simulation.indicators import Indicators, Watched, looked_at, wanted_steps
 from mpmopt.simulation.simulation import Forward, Gradient, Simulation, check_terminal_adjoints
+from mpmopt.simulation.surroundings import holders
 
 
 class LagrangianSimulation(Simulation):
@@ -72,6 +73,12 @@ class LagrangianSimulation(Simulation):
         grip, self._grip_slope = pairs.grips(
             of_particles(self.data.stiffness), constants[0] + 2.0 * constants[1], dx / per_cell, dx
         )
+        at = np.stack(np.meshgrid(np.arange(width), np.arange(rows + 2), indexing="xy"))
+        self.start = np.zeros((4, self.nodes), dtype)
+        self.start[:2] = (at.reshape(2, -1) - 0.5 + low[:, None]) * dx
+        # Nodes are in the middle of cells: so all nodes of a cell are held that is in a clamp.
+        holder = holders(self.start[:2].real, self.parameters.clamps[0], 0.5 * dx)
+        held = np.nonzero(holder >= 0)[0]
         self.lattice = lagrangian.Lattice(
             dt=scene.time_step,
             dx=dx,
@@ -95,13 +102,13 @@ class LagrangianSimulation(Simulation):
             actuation_stress=self.data.actuation_stress,
             mass=self._folded(mass, axis, columns, width),
             touch=self._touch(cell, place, low, high, grip),
+            held=held,
+            holder=holder[held],
+            clamps=self.parameters.clamps,
             ground=self.parameters.ground,
             nodes_y=self.parameters.nodes_y,
             nodes_x=self.parameters.nodes_x,
         )
-        at = np.stack(np.meshgrid(np.arange(width), np.arange(rows + 2), indexing="xy"))
-        self.start = np.zeros((4, self.nodes), dtype)
-        self.start[:2] = (at.reshape(2, -1) - 0.5 + low[:, None]) * dx
 
     def _cells(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """First cell of the body along both axes, and the one after its last."""
@@ -223,11 +230,12 @@ class LagrangianSimulation(Simulation):
     def _advance(self, states: NDArray, first: int, last: int, begin: int) -> None:
         """Steps `first` to `last`; slots and signals are counted from step `begin`."""
         signal = self.signal[begin:]
+        lattice = self.lattice._replace(clamps=self.parameters.clamps[begin:])
         step = first
         while step < last:
             stop = min(last, step + self.steps_per_call)
             reached, node = lagrangian.advance_lattice(
-                states, step - begin, stop - begin, self.lattice, signal
+                states, step - begin, stop - begin, lattice, signal
             )
             if node >= 0:
                 x, y = (float(c) for c in np.real(states[reached % len(states), :2, node]))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mpmopt import kernels
 from mpmopt.kernels import contact, ground
@@ -33,6 +34,20 @@ def parameters_of(scene: Scene) -> kernels.Parameters:
         viscous=any(material.viscosity > 0.0 for material in scene.materials),
         mass_tolerance=0.0,
     )
+
+
+def holders(
+    places: NDArray[np.float64], clamps: NDArray[np.float64], reach: float = 0.0
+) -> NDArray[np.int64]:
+    """The first of the clamps (K, 6) of a step that holds what is at places (2, M), or -1: (M,).
+
+    They hold as far out as `reach`; without it, as `kernels.contact.clamp_of` says.
+    """
+    found = np.full(places.shape[1], -1)
+    for k in reversed(range(len(clamps))):
+        low, high = clamps[k, 0:2, None] - reach, clamps[k, 2:4, None] + reach
+        found[((low <= places) & (places <= high)).all(axis=0)] = k
+    return found
 
 
 def _ground_of(scene: Scene) -> ground.Ground:
