@@ -225,7 +225,7 @@ def settings(quick: bool) -> list[tuple[int, float, Choice]]:
     return points
 
 
-COURANTS = (0.05, 0.1, 0.2, 0.4, 0.6, 0.8)
+COURANTS = (0.05, 0.1, 0.2, 0.3, 0.4, 0.6, 0.8)
 PAPER = (128, ROBOTS["walker"][0].courant, PLAIN)
 RECOMMENDED = (128, 0.6, PLAIN)
 # The reference is at the Courant number of the recommended setting.

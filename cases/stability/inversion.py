@@ -192,7 +192,7 @@ def points(quick: bool) -> Points:
         {"amplitude": amplitude, "cells": cells, "courant": courant, "formulation": formulation}
         for formulation in ("updated", "total")
         for courant in ((0.2,) if quick else (0.2, 0.4))
-        for cells in ((24, 48) if quick else (24, 48, 96))
+        for cells in ((24, 48) if quick or formulation == "total" else (24, 48, 96))
         for amplitude in (AMPLITUDES[1::2] if quick else AMPLITUDES)
     ]
     return {one_vortex: vortices}

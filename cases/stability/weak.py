@@ -175,11 +175,11 @@ def points(quick: bool) -> Points:
         if not (heavy and epsilon == HEAVY)  # is among the equal ones
     ]  # fmt: skip
     squares += [
-        {"case": case, "courant": courant, "epsilon": epsilon, "heavy": heavy,
-         "designs": 2 if quick else 4, "formulation": "total"}
+        {"case": case, "courant": courant, "epsilon": epsilon, "heavy": heavy, "designs": 2,
+         "formulation": "total"}
         for case in TOTAL_CASES
         for heavy in (False, True)
-        for epsilon in (EPSILONS[2:3] if quick else EPSILONS[1:])
+        for epsilon in (EPSILONS[2:3] if quick else EPSILONS[1:4])
         for courant in TOTAL_COURANTS
     ]  # fmt: skip
     return {one_square: squares}
