@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from walker import CASES, slanted_legs, walker
 
+from mpmopt.app import case
 from mpmopt.app.case import Case, ProgressBar, most_evaluations, resume, run
 from mpmopt.app.script import main
 from mpmopt.assess.threshold import pieces
@@ -163,6 +164,22 @@ def test_a_picture_that_fails_spoils_no_run(tmp_path, caplog, monkeypatch, how):
     assert json.loads((tmp_path / "summary.json").read_text()) == summary
     assert runfile.read_run(tmp_path / "run.h5").summary == summary
     assert run(TINY, tmp_path) == resume(tmp_path / "run.h5") == summary
+
+
+@pytest.mark.parametrize("full", [True, False])
+def test_a_run_that_was_stopped_is_studied_as_it_would_have_been(tmp_path, monkeypatch, full):
+    def stopped(begun, callbacks, checkpointing):
+        callbacks[0](begun)
+        raise KeyboardInterrupt
+
+    asked = []
+    monkeypatch.setattr(case, "RESULTS", ())
+    monkeypatch.setattr(case, "summarise", lambda *words: {"asked": asked.append(words[2])})
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(case, "go_on", stopped)
+        run(TINY, tmp_path, full_study=full)
+    resume(tmp_path / "run.h5")
+    assert asked == [full]
 
 
 def test_a_start_is_filled_up_and_knows_its_names():
