@@ -486,11 +486,11 @@ def _parser() -> argparse.ArgumentParser:
         "study",
         "try its best design elsewhere",
         "Say how much of its gain the best design, without void, keeps with half the step, twice\n"
-        "the step, and cells half as wide: numerical propulsion keeps little. Then, of a robot on\n"
-        "ground, how fast it goes on ground of other frictions, in both formulations on other\n"
-        "cells, with stronger and faster actuators, without actuation and after a push, and for\n"
-        "how long it goes on. The numbers go to the run file and summary.json, and robustness.png\n"
-        "shows them.",
+        "the step where that is stable, cells half as wide, and in the other formulation:\n"
+        "numerical propulsion keeps little. Then, of a robot on ground, how fast it goes on\n"
+        "ground of other frictions, in both formulations on other cells, with stronger and\n"
+        "faster actuators, without actuation and after a push, and for how long it goes on. The\n"
+        "numbers go to the run file and summary.json, and robustness.png shows them.",
         "out/walker/run.h5",
     )
     command.set_defaults(do=study)

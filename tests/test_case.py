@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from walker import CASES, slanted_legs, walker
 
-from mpmopt.app import case
+from mpmopt.app import case as one_case
 from mpmopt.app.case import Case, ProgressBar, most_evaluations, resume, run
 from mpmopt.app.script import main
 from mpmopt.assess.threshold import pieces
@@ -173,10 +173,10 @@ def test_a_run_that_was_stopped_is_studied_as_it_would_have_been(tmp_path, monke
         raise KeyboardInterrupt
 
     asked = []
-    monkeypatch.setattr(case, "RESULTS", ())
-    monkeypatch.setattr(case, "summarise", lambda *words: {"asked": asked.append(words[2])})
+    monkeypatch.setattr(one_case, "RESULTS", ())
+    monkeypatch.setattr(one_case, "summarise", lambda *words: {"asked": asked.append(words[2])})
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(case, "go_on", stopped)
+        patch.setattr(one_case, "go_on", stopped)
         run(TINY, tmp_path, full_study=full)
     resume(tmp_path / "run.h5")
     assert asked == [full]
