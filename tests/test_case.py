@@ -174,9 +174,13 @@ def test_a_run_that_was_stopped_is_studied_as_it_would_have_been(tmp_path, monke
         callbacks[0](begun)
         raise KeyboardInterrupt
 
-    asked = []
+    def noted(result, baseline, full_study):
+        asked.append(full_study)
+        return {"evaluations": 0}
+
+    asked: list[bool] = []
     monkeypatch.setattr(one_case, "RESULTS", ())
-    monkeypatch.setattr(one_case, "summarise", lambda *words: {"asked": asked.append(words[2])})
+    monkeypatch.setattr(one_case, "summarise", noted)
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(one_case, "go_on", stopped)
         run(TINY, tmp_path, full_study=full)
