@@ -134,11 +134,19 @@ def test_a_second_signal_ends_the_process_at_once(second):
     assert process.returncode == -second
 
 
-def test_a_signal_that_a_library_swallows_is_not_lost(capfd):
-    @ctypes.CFUNCTYPE(None)
-    def callback():  # as a compiler has them
-        os.kill(os.getpid(), signal.SIGTERM)
+@ctypes.CFUNCTYPE(None)
+def callback():  # as a compiler has them
+    os.kill(os.getpid(), signal.SIGTERM)
 
+
+def test_a_signal_that_a_library_swallows_comes_again(capfd):
+    with pytest.raises(Interrupted, match="SIGTERM"), interruptible():
+        callback()
+        time.sleep(20)
+    assert capfd.readouterr().err == ""
+
+
+def test_a_signal_that_a_library_swallows_is_not_lost(capfd):
     with pytest.raises(Interrupted, match="SIGTERM"), interruptible():
         callback()
         raise RuntimeError("no compiled object yet")

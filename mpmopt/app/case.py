@@ -159,7 +159,8 @@ def run(
     phi : callable, optional
         Of positions (D, 2): phi (D,) that a run begins with, instead of the case's.
     full_study : bool, optional
-        Try the finished robot in all ways of `robustness.study`, not only in some.
+        Try the finished robot in all ways of `robustness.study`, not only in some. The run file
+        remembers it, for `resume`.
 
     Returns
     -------
@@ -202,10 +203,11 @@ def run(
                     f"{path} holds an earlier run of another case; choose another folder, or "
                     "--force to replace it"
                 )
-            return _go_on(path, kept, checkpointing, full_study)
+            kept = replace(kept, full_study=full_study or kept.full_study)
+            return _go_on(path, kept, checkpointing)
         refuse_existing((folder / name for name in RESULTS), force)
-        runfile.write(path, new, baseline=baseline)
-        return _go_on(path, runfile.read_run(path), checkpointing, full_study)
+        runfile.write(path, new, baseline=baseline, full_study=full_study)
+        return _go_on(path, runfile.read_run(path), checkpointing)
 
 
 def resume(
@@ -255,10 +257,7 @@ def baseline_particles(case: Case) -> NDArray[np.bool_]:
 
 
 def _go_on(
-    path: Path,
-    kept: runfile.RunFile,
-    checkpointing: Checkpointing | None,
-    full_study: bool = False,
+    path: Path, kept: runfile.RunFile, checkpointing: Checkpointing | None
 ) -> dict[str, Any]:
     if kept.summary:
         say(f"{path} holds a finished run.")
@@ -268,14 +267,14 @@ def _go_on(
     if kept.run.history:
         say(f"Going on after {len(kept.run.history)} evaluations.")
 
-    def save(current: Optimisation) -> None:
-        runfile.write(path, current, baseline=kept.baseline)
+    def save(current: Optimisation, summary: Mapping[str, Any] | None = None) -> None:
+        runfile.write(path, current, summary, kept.baseline, kept.full_study)
 
     result = go_on(kept.run, [save, ProgressBar()], checkpointing)
-    summary = summarise(result, kept.baseline, full_study)
+    summary = summarise(result, kept.baseline, kept.full_study)
     text = json.dumps(summary, indent=1) + "\n"
     replace_file(path.parent / "summary.json", text.encode())
-    runfile.write(path, result, summary, kept.baseline)
+    save(result, summary)
     drawn = RESULTS[1:] if "speed" in summary else RESULTS[1:4]
     for name in drawn:
         draw_or_warn(path.parent / name, lambda target: _draw(target, result, summary, path))

@@ -56,7 +56,7 @@ def full_study(path: str | os.PathLike[str]) -> str:
                 summary |= robustness.study(problem, x, full=True, progress=show)
             text = json.dumps(summary, indent=1) + "\n"
             replace_file(path.parent / "summary.json", text.encode())
-            runfile.write(path, kept.run, summary, kept.baseline)
+            runfile.write(path, kept.run, summary, kept.baseline, kept.full_study)
         if "speed" in summary:
             from mpmopt.view.gait import plot_robustness
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import label
 
 from mpmopt.assess import threshold
-from mpmopt.assess.refinement import other_formulation
+from mpmopt.assess.refinement import other_formulation, with_twice_the_step
 from mpmopt.assess.threshold import SOLID_LIMITS, solid_body
 from mpmopt.design.actuation import frequencies
 from mpmopt.design.ensemble import side_by_side
@@ -356,7 +356,8 @@ def study(
     -------
     dict
         ``speed``; ``speed_by_friction``, and where it is full ``speed_by_strength``,
-        ``speed_by_frequency``, ``speed_by_step`` (times the run's) and, of both formulations,
+        ``speed_by_frequency``, ``speed_by_step`` (times the run's,
+        as far as it is stable) and, of both formulations,
         ``speed_by_cells`` (along the grid's shorter side), by numbers as text; ``kept``, shares of
         the speed with half the step, with cells half as wide, and where it is full a quarter as
         wide, and half as wide in the other formulation; ``driven_share``, what is missing when the
@@ -445,7 +446,9 @@ def _trials(scene: Scene, full: bool) -> dict[str, Trial]:
         trials |= {"cells 4": cells(4.0), "other 2": cells(2.0, other)}
     trials |= {"cells 2": cells(2.0), "step 0.5": steps(0.5)}
     if full:
-        trials |= {"other 1": cells(1.0, other), "step 2": steps(2.0)}
+        trials["other 1"] = cells(1.0, other)
+        if with_twice_the_step(scene) is not None:
+            trials["step 2"] = steps(2.0)
         trials |= {"cells 0.5": cells(0.5), "other 0.5": cells(0.5, other)}
         trials |= {f"strength {value:g}": strength(value) for value in CHANGES}
         trials |= {f"frequency {value:g}": frequency(value) for value in CHANGES}
