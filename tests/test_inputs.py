@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from conftest import SHORT, small_scene
 
-from mpmopt.app.case import Case, ProgressBar, baseline_particles, resume, run
+from mpmopt.app.case import Case, baseline_particles, resume, run
 from mpmopt.app.multistart import multistart
 from mpmopt.app.summary import summarise
 from mpmopt.assess.refinement import study
@@ -21,6 +21,7 @@ from mpmopt.optimisation.settings import Settings, Stage
 from mpmopt.results import runfile
 from mpmopt.scene import Actuator, Design, Mirror, Scene, Solid
 from mpmopt.simulation.checkpoints import Checkpointing
+from mpmopt.view.live import ProgressBar
 
 C = 1 / 16
 SCENE = small_scene(steps=4)

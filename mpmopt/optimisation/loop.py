@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
@@ -46,6 +47,8 @@ def optimise(
     task: Task = DEFAULT_TASK,
 ) -> Optimisation:
     """Maximise a task's objective subject to its constraints, stage by stage.
+
+    In a notebook a bar shows how far it is, and a picture below it the best design so far.
 
     An evaluation that fails steps back to the stage's incumbent and halves the move limit, which
     then recovers slowly. A stage of which no design ran yet takes the best of the one before, and
@@ -170,6 +173,10 @@ def go_on(
         )
     if run.stop_reason:
         return run
+    if "ipykernel" in sys.modules:  # in a notebook
+        from mpmopt.view.live import watched
+
+        all_callbacks = watched(all_callbacks)
     began = time.monotonic() - (run.history[-1].seconds if run.history else 0.0)
 
     def report() -> None:
