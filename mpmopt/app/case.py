@@ -24,7 +24,7 @@ from mpmopt.io.files import locked, make_folder, refuse_existing, replace_file
 from mpmopt.io.pictures import read_picture
 from mpmopt.optimisation.history import Optimisation
 from mpmopt.optimisation.loop import HOW, begin, go_on
-from mpmopt.optimisation.settings import Settings
+from mpmopt.optimisation.settings import FLOORS, Settings
 from mpmopt.results import runfile
 from mpmopt.scene import Scene
 from mpmopt.scene.particles import discretise
@@ -93,8 +93,8 @@ class Case:
             stages = tuple(
                 replace(
                     stage,
-                    void_density=max(stage.void_density, 1e-2),
-                    void_stiffness=max(stage.void_stiffness, 1e-3),
+                    void_density=max(stage.void_density or 0.0, FLOORS[formulation][0]),
+                    void_stiffness=max(stage.void_stiffness or 0.0, FLOORS[formulation][1]),
                     void_cutoff=0.05 if stage.solid else stage.void_cutoff,
                 )
                 for stage in stages

@@ -16,11 +16,11 @@ from mpmopt.assess.threshold import post_processed
 from mpmopt.design.chain import non_discreteness
 from mpmopt.design.problem import Problem
 from mpmopt.design.task import DEFAULT_TASK, FEASIBLE, Task
-from mpmopt.design.variables import Freedom, completed
+from mpmopt.design.variables import START, Freedom, completed
 from mpmopt.errors import DesignError, SceneError, SimulationError
 from mpmopt.optimisation.history import Candidate, Iteration, Optimisation, StageState
 from mpmopt.optimisation.mma import MovingAsymptotes
-from mpmopt.optimisation.settings import Settings
+from mpmopt.optimisation.settings import DEFAULT_SETTINGS, Settings
 from mpmopt.scene import Scene
 from mpmopt.simulation.checkpoints import Checkpointing
 from mpmopt.simulation.indicators import Indicators
@@ -35,13 +35,13 @@ HALVINGS = 3
 
 
 Callback = Callable[[Optimisation], None]
-HOW = "write Settings(stages), or call what makes them, such as continuation(time_step)"
+HOW = "write Settings(most_iterations=25), or call what makes them, such as continuation()"
 
 
 def optimise(
     scene: Scene,
-    settings: Settings,
-    start: NDArray[np.float64] | Sequence[float] | Mapping[str, Any],
+    settings: Settings = DEFAULT_SETTINGS,
+    start: NDArray[np.float64] | Sequence[float] | Mapping[str, Any] = START,
     callbacks: Iterable[Callback] | Callback = (),
     checkpointing: Checkpointing | None = None,
     task: Task = DEFAULT_TASK,
@@ -58,8 +58,9 @@ def optimise(
     Parameters
     ----------
     scene : Scene
-    settings : Settings
-    start : mapping or (n,) array
+    settings : Settings, optional
+        Default: up to 200 iterations of each of `settings.STAGES`.
+    start : mapping or (n,) array, optional
         First design, within [-1, 1]: what `Problem.join` takes, by name, such as
         ``{"phi": picture}``, the rest as in `variables.START`; or the vector that it makes for the
         first stage's scene.
