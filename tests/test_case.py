@@ -18,7 +18,7 @@ import pytest
 from walker import CASES, slanted_legs, walker
 
 from mpmopt.app import case as one_case
-from mpmopt.app.case import Case, ProgressBar, most_evaluations, resume, run
+from mpmopt.app.case import Case, resume, run
 from mpmopt.app.script import main
 from mpmopt.assess.threshold import pieces
 from mpmopt.design.problem import Problem
@@ -30,6 +30,7 @@ from mpmopt.optimisation.presets import IN_ONE_PIECE
 from mpmopt.optimisation.settings import Settings, Stage
 from mpmopt.results import runfile
 from mpmopt.view import plot
+from mpmopt.view.live import ProgressBar, most_evaluations
 
 SMALL = Case(
     walker(64, 8e-4),

@@ -95,6 +95,13 @@ def test_a_killed_run_ends_as_it_would_have(whole, tmp_path):
 
 
 @pytest.mark.process
+def test_a_run_in_three_scenes_ends_as_it_would_have_for_any_threads_and_kills(tmp_path):
+    rows = faults.ensembles(tmp_path, 2, random.Random(3))
+    assert sum(row.done for row in rows) == 2 + 2
+    assert all(row.survived == row.done for row in rows), rows
+
+
+@pytest.mark.process
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_signal_ends_a_run_with_its_code_and_says_how_to_go_on(whole, tmp_path, number, code):
     process = faults.Process(tmp_path / "out")

@@ -148,11 +148,14 @@ def _moved(scene: Scene, dx: float, dy: float) -> dict[str, Any]:
     }
 
 
-def refined(scene: Scene, multiple: float = 1.0, formulation: Formulation | None = None) -> Scene:
+def with_cells(
+    scene: Scene, multiple: float = 1.0, formulation: Formulation | None = None
+) -> Scene:
     """The scene with so many times its cells along each axis, and in another formulation.
 
-    The step is as much shorter as cells are narrower, and shorter still where viscosity or a layer
-    need that. It has no design filter, which no solid body needs.
+    The step is as much shorter as cells are narrower (`variation.refined` leaves it at that, so
+    that only cells differ), and shorter still where viscosity or a layer need that. It has no
+    design filter, which no solid body needs.
 
     Raises
     ------
@@ -427,7 +430,7 @@ def _trials(scene: Scene, full: bool) -> dict[str, Trial]:
     other = other_formulation(scene)
 
     def cells(multiple: float, formulation: Formulation | None = None) -> Trial:
-        return Trial(lambda: refined(scene, multiple, formulation))
+        return Trial(lambda: with_cells(scene, multiple, formulation))
 
     def steps(multiple: float) -> Trial:
         return Trial(lambda: replace(scene, time_step=multiple * scene.time_step))

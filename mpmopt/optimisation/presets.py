@@ -12,7 +12,7 @@ from mpmopt.optimisation.settings import Settings, Stage
 IN_ONE_PIECE = Task(subject_to=(AtMost(OnePiece(), math.log(4.0)),))
 
 
-def continuation(time_step: float, most_iterations: int = 25) -> Settings:
+def continuation(time_step: float | None = None, most_iterations: int = 25) -> Settings:
     """Beta from 0.5 to 32; void weighs 1e-2 of a solid, until what is clear void is left out.
 
     From 8 on, that is, when designs are judged solid too, with the least of their refinement study.

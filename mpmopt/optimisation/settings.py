@@ -12,11 +12,15 @@ from mpmopt.design.step_control import LIMITS
 from mpmopt.design.task import DEFAULT_TASK, Task
 from mpmopt.errors import DesignError
 from mpmopt.scene import Scene
+from mpmopt.scene.scene import Formulation
 from mpmopt.simulation.checkpoints import Checkpointing
 from mpmopt.validation import count, flag, number, share, shown
 
 # Successful evaluations of a stage before the stop rule may end it.
 LEAST = 20
+# Density and stiffness of void, over those of solid. In the updated formulation void is torn and
+# flung when it is lighter; in the total Lagrangian it may be light.
+FLOORS: Mapping[Formulation, tuple[float, float]] = {"updated": (1e-2, 1e-3), "total": (2e-3, 2e-4)}
 
 
 def _take(owner: Any, check: Callable[..., Any], names: str, **limits: float) -> None:
@@ -36,9 +40,10 @@ class Stage:
     ----------
     beta : float
         Sharpness of the projection.
-    void_density, void_stiffness : float
-        Share of mass and stiffness that void keeps.
-    time_step : float
+    void_density, void_stiffness : float, optional
+        Share of mass and stiffness that void keeps; default: `FLOORS` of the scene's formulation.
+    time_step : float, optional
+        Default: the scene's.
     solid : bool
         Whether the best design is the one that goes farthest once its void is removed
         (`threshold.post_processed`), which costs a forward run more, instead of as it is. The
@@ -69,9 +74,9 @@ class Stage:
     """
 
     beta: float
-    void_density: float
-    void_stiffness: float
-    time_step: float
+    void_density: float | None = None
+    void_stiffness: float | None = None
+    time_step: float | None = None
     solid: bool = False
     refined: bool = False
     move_limit: float = 0.05
@@ -84,8 +89,9 @@ class Stage:
     def __post_init__(self) -> None:
         _take(self, number, "beta void_density void_stiffness time_step move_limit", above=0.0)
         for name in ("void_density", "void_stiffness", "move_limit"):
-            if getattr(self, name) > 1.0:
-                raise DesignError(f"Stage: {name} = {getattr(self, name)} must be at most 1")
+            value = getattr(self, name)
+            if value is not None and value > 1.0:
+                raise DesignError(f"Stage: {name} = {value} must be at most 1")
         _take(self, share, "void_cutoff")
         _take(self, flag, "solid refined limited subpixel")
         if self.refined and not self.solid:
@@ -95,10 +101,11 @@ class Stage:
 
     def scene(self, scene: Scene) -> Scene:
         """The scene as this stage simulates it."""
+        density, stiffness = FLOORS[scene.formulation]
         return scene.vary(
             time_step=self.time_step,
-            void_density=self.void_density,
-            void_stiffness=self.void_stiffness,
+            void_density=density if self.void_density is None else self.void_density,
+            void_stiffness=stiffness if self.void_stiffness is None else self.void_stiffness,
         )
 
     def problem(
@@ -122,14 +129,18 @@ class Stage:
         )
 
 
+# A short continuation for any scene; the last stage counts designs without their void.
+STAGES = (Stage(1.0), Stage(4.0), Stage(16.0, solid=True))
+
+
 @dataclass(frozen=True)
 class Settings:
     """How to optimise.
 
     Attributes
     ----------
-    stages : tuple of Stage
-        Or a single one.
+    stages : tuple of Stage, optional
+        Or a single one; default: `STAGES`.
     adapt_move_limit : bool
         Shorten the move limit after a step that went back, and lengthen it, up to the stage's,
         after one that went on.
@@ -159,7 +170,7 @@ class Settings:
         If there is no stage or a number makes no sense.
     """
 
-    stages: tuple[Stage, ...]
+    stages: tuple[Stage, ...] = STAGES
     adapt_move_limit: bool = True
     sharpen_asymptotes: bool = True
     asymptote_min: float = 1e-6
@@ -198,3 +209,6 @@ class Settings:
     def from_dict(cls, values: Mapping[str, Any]) -> Settings:
         """The settings of which `dataclasses.asdict` makes these values."""
         return cls(**{**values, "stages": tuple(Stage(**stage) for stage in values["stages"])})
+
+
+DEFAULT_SETTINGS = Settings()
