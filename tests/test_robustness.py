@@ -106,6 +106,9 @@ def test_a_speed_is_the_way_over_the_time_in_whole_periods(formulation, soon):
     assert pushed == pytest.approx(g * (0.024 + later) / 2 - back, rel=0.02)
     with pytest.raises(SceneError, match="particles times steps"):
         speed(robot, Trial(lambda: scene), most_work=100.0)
+    quick = dataclasses.replace(scene, steps=1500, transient=2.0)
+    end = whole_periods(robot.period(quick), 0.04, 0.32)
+    assert speed(robot, Trial(lambda: quick)) == pytest.approx(g * (0.04 + end) / 2, rel=0.02)
 
 
 def test_an_actuation_that_is_held_is_the_same_till_then(soon, monkeypatch):

@@ -32,7 +32,7 @@ from mpmopt.scene.particles import Particles, discretise, mirror_images, nearest
 from mpmopt.scene.scene import LAGRANGIAN_LIMIT, Formulation
 from mpmopt.simulation.simulation import Simulation
 
-# In the scene's unit of time: what comes before does not count, and when a speed has been seen.
+# In units of `unit`: what comes before does not count, and when a speed has been seen.
 SETTLED, SEEN, FOLLOWED = 2.0, 8.0, 20.0
 FEW_FRICTIONS = (0.2, 0.35, 0.5, 0.8)
 FRICTIONS = (0.2, 0.3, 0.35, 0.5, 0.65, 0.8, 1.5)
@@ -107,6 +107,11 @@ def _corner(scene: Scene) -> NDArray[np.float64]:
 def can_be_studied(scene: Scene) -> bool:
     """Whether a scene's robot is driven, on ground whose friction is a number."""
     return bool(scene.actuators and scene.ground)
+
+
+def unit(scene: Scene) -> float:
+    """The unit of this file's times: the scene's transient, or its unit of time if it has none."""
+    return scene.transient or 1.0
 
 
 def whole_periods(period: float, begin: float, end: float) -> float:
@@ -201,8 +206,8 @@ class Trial(NamedTuple):
 def speed(robot: Robot, trial: Trial, most_work: float = math.inf) -> float:
     """Mean speed of a robot along the direction of travel, over whole periods.
 
-    From `SETTLED` to `SEEN`, or from `RECOVERED` where it is pushed: its solid and actuators'
-    centroid at the end, less that at the beginning, over the time between.
+    From `SETTLED` to `SEEN`, or from `RECOVERED` where it is pushed, in units of `unit`: its solid
+    and actuators' centroid at the end, less that at the beginning, over the time between.
 
     Raises
     ------
@@ -210,8 +215,9 @@ def speed(robot: Robot, trial: Trial, most_work: float = math.inf) -> float:
         If that cannot be simulated, or goes beyond `threshold.SOLID_LIMITS`, or takes too long.
     """
     scene = trial.scene()
-    begin = RECOVERED if trial.pushed else SETTLED
-    end = whole_periods(robot.period(scene), begin, SEEN)
+    one = unit(scene)
+    begin = one * (RECOVERED if trial.pushed else SETTLED)
+    end = whole_periods(robot.period(scene), begin, one * SEEN)
     scene = lasting(scene, end)
     simulation = robot.body(scene)
     work = float(simulation.initial.shape[1]) * scene.steps
@@ -221,7 +227,7 @@ def speed(robot: Robot, trial: Trial, most_work: float = math.inf) -> float:
     if trial.frozen:
         simulation.signal[first:] = simulation.signal[first]
     if trial.pushed:
-        past = round(PUSHED / scene.time_step)
+        past = round(one * PUSHED / scene.time_step)
         back = -PUSH * scene.wave_speed
         velocity = back * scene.direction[0], back * scene.direction[1]
         simulation = simulation.pushed(past, velocity)
@@ -240,7 +246,7 @@ class Followed:
     Attributes
     ----------
     seconds : float
-        Until it falls, stops or cannot be simulated, or `FOLLOWED`.
+        Until it falls, stops or cannot be simulated, or `FOLLOWED` times `unit`.
     end : str
         "goes on", "falls", "stops", or why it cannot be simulated.
     """
@@ -254,9 +260,10 @@ def follow(robot: Robot, scene: Scene) -> Followed:
 
     It falls where its solid and actuators, on the average, lean by 45 degrees, or their centroid is
     half as far from the ground as at first. It stops where it goes less than a tenth of its speed
-    for two seconds.
+    for `PAUSE` times `unit`.
     """
-    scene = lasting(scene, FOLLOWED)
+    one = unit(scene)
+    scene = lasting(scene, one * FOLLOWED)
     simulation = robot.body(scene)
     every = max(1, round(0.25 * robot.period(scene) / scene.time_step))
     frames = np.arange(0, scene.steps + 1, every)
@@ -272,18 +279,18 @@ def follow(robot: Robot, scene: Scene) -> Followed:
     if scene.mirror is None:  # of half a body both sides may lean
         fallen |= np.abs(angle) > LEANS
     time = time[: len(way)]
-    seen = np.flatnonzero((time >= SETTLED) & (time <= SEEN))
+    seen = np.flatnonzero((time >= one * SETTLED) & (time <= one * SEEN))
     first, last = (seen[0], seen[-1]) if seen.size > 1 else (0, -1)
     mean = max(float(way[last] - way[first]) / float(np.ptp(time[[first, last]]) or 1.0), 0.0)
-    pause = max(1, round(PAUSE / (every * scene.time_step)))
-    slow = way[pause:] - way[: len(way) - pause] <= SLOW * mean * PAUSE
+    pause = max(1, round(one * PAUSE / (every * scene.time_step)))
+    slow = way[pause:] - way[: len(way) - pause] <= SLOW * mean * one * PAUSE
     events = [(float(time[fallen.argmax()]), "falls")] if fallen.any() else []
-    late = np.flatnonzero(slow & (time[: len(slow)] >= SETTLED))
+    late = np.flatnonzero(slow & (time[: len(slow)] >= one * SETTLED))
     if late.size:
         events.append((float(time[late[0]]), "stops"))
     if failure is not None:
         events.append((failure.step * scene.time_step, failure.what))
-    return Followed(*min(events, default=(FOLLOWED, "goes on")))
+    return Followed(*min(events, default=(one * FOLLOWED, "goes on")))
 
 
 def track(
