@@ -143,8 +143,10 @@ class Cooled(Term):
         a, b, g, _, T = self._solved(outcome)
         t = np.append(T, 0.0)
         k_bar = (t[a] - t[b]) ** 2
-        g_bar = np.bincount(a, 2 * 0.999 * g[a] * g[b] ** 2 * k_bar, g.size)
-        g_bar += np.bincount(b, 2 * 0.999 * g[a] ** 2 * g[b] * k_bar, g.size)
+        k_bar *= 2.0 * 0.999 * g[a] * g[b]
+        g_bar = np.zeros(g.size)
+        np.add.at(g_bar, a, g[b] * k_bar)
+        np.add.at(g_bar, b, g[a] * k_bar)
         return Adjoints(gamma=g_bar[:-1])
 
 
