@@ -243,10 +243,10 @@ def test_where_a_bar_is_held_is_a_known_place(per_cell, expected):
 
 
 def test_both_formulations_bend_a_held_beam_alike_the_more_so_the_finer_cells_are():
-    tips = np.array([[tip(n, formulation) for formulation in FORMULATIONS] for n in (1, 2)])
-    assert (tips < -0.3).all()
+    tips = np.array([[tip(n, formulation) for formulation in FORMULATIONS] for n in (2, 4)])
+    assert (tips < -1.5).all()
     coarse, fine = np.abs(tips[:, 1] / tips[:, 0] - 1.0)
-    assert fine <= 0.6 * coarse <= 0.05
+    assert fine <= 0.65 * coarse <= 0.02
 
 
 def tip(n, formulation):
@@ -277,18 +277,17 @@ def test_the_books_have_the_force_and_the_work_of_clamps(formulation):
     mass = simulation.data.volume.sum() / len(last[0]) * np.ones(len(last[0]))  # density is 1
     momentum, weight = last[2:4] @ mass, mass.sum() * np.array(scene.gravity)
     given = scene.time_step * coarse.force.sum(axis=(0, 1)) + coarse.time[-1] * weight
-    if formulation == "total":
-        assert given == pytest.approx(momentum, rel=1e-9, abs=1e-12)
+    assert given == pytest.approx(momentum, rel=1e-9, abs=1e-12)
     assert coarse.supports == ("clamp 0", "clamp 1")
     assert not coarse.work["walls"].any()
     # What moves the finger against what holds it pulls it apart.
-    assert coarse.work["clamps"][-1] > 0.5 * coarse.turnover
+    assert coarse.work["clamps"][-1] > 0.2 * coarse.turnover
     for k, (low, high) in enumerate([(1, 6.5), (8.5, 14)]):
         x = coarse.place[1:, k, 0]
         assert np.all((low * C < x) & (x < high * C + 0.02))
     assert np.abs(coarse.residual).max() <= 2e-3 * coarse.turnover
     assert np.abs(fine.residual).max() <= 0.35 * np.abs(coarse.residual).max()
-    assert fine.work["clamps"][-1] == pytest.approx(coarse.work["clamps"][-1], rel=0.02)
+    assert fine.work["clamps"][-1] == pytest.approx(coarse.work["clamps"][-1], rel=0.05)
 
 
 def test_the_books_of_half_a_clamped_lattice_are_those_of_the_whole():
