@@ -70,8 +70,8 @@ TASK = replace(
 )
 
 CASES = {
-    "default": Case(climber(64, 1e-3, 4.0), creep(1e-3, 25), slanted_legs, START, TASK),
-    "preview": Case(climber(64, 1e-3, 3.0), creep(1e-3, 15), slanted_legs, START, TASK),
+    "default": Case(climber(64, 1e-3, 4.0), creep(25), slanted_legs, START, TASK),
+    "preview": Case(climber(64, 1e-3, 3.0), creep(15), slanted_legs, START, TASK),
 }
 
 if __name__ == "__main__":

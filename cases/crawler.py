@@ -97,8 +97,8 @@ TASK = Task(
 )
 
 CASES = {
-    "default": Case(crawler_on_ground(64, 1e-3, 4.0), creep(1e-3, 25), slanted_legs, START, TASK),
-    "preview": Case(crawler_on_ground(64, 1e-3, 3.0), creep(1e-3, 15), slanted_legs, START, TASK),
+    "default": Case(crawler_on_ground(64, 1e-3, 4.0), creep(25), slanted_legs, START, TASK),
+    "preview": Case(crawler_on_ground(64, 1e-3, 3.0), creep(15), slanted_legs, START, TASK),
     "paper": Case(crawler(128, 2e-4), paper_preset(2e-4), slanted_legs),
 }
 

@@ -78,8 +78,8 @@ def start(positions: np.ndarray) -> np.ndarray:
 START = {"phi": start}
 
 CASES = {
-    "default": Case(silicone_walker(0.5), gait(TIME_STEP, 120), slanted_legs, START, walker.TASK),
-    "preview": Case(silicone_walker(), gait(TIME_STEP, 40), slanted_legs, START, walker.TASK),
+    "default": Case(silicone_walker(0.5), gait(120), slanted_legs, START, walker.TASK),
+    "preview": Case(silicone_walker(), gait(40), slanted_legs, START, walker.TASK),
 }
 
 if __name__ == "__main__":
