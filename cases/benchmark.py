@@ -159,12 +159,15 @@ def formulations(steps: int, rounds: int) -> str:
     rows.append(
         [
             "two scenes take as long as one, times",
-            *(f"{ratio(seconds[f'two {k}'], seconds[f'both {k}']):.2f}" for k in ("updated", "total")),
+            *(
+                f"{ratio(seconds[f'two {kind}'], seconds[f'both {kind}']):.2f}"
+                for kind in ("updated", "total")
+            ),
             "",
         ]
     )
     header = ["ns per particle and step", "MLS-MPM", "total Lagrangian", "ratio"]
-    title = f"The walker on ground, {count} particles, {steps} steps, states kept, one thread a scene"
+    title = f"The walker on ground, {count} particles, {steps} steps, one thread a scene"
     return table(title, header, rows)
 
 
@@ -184,7 +187,9 @@ def sizes_on_ground(quick: bool, rounds: int) -> str:
         costs.append(cost)
         times = [f"{mine / first:.2f}" for mine, first in zip(cost, costs[0])]
         rows.append([f"{count}", f"{cost[0]:.1f}", times[0], f"{cost[1]:.1f}", times[1]])
-    header = ["particles", "forward ns", "times the first", "value + gradient ns", "times the first"]
+    header = [
+        "particles", "forward ns", "times the first", "value + gradient ns", "times the first"
+    ]  # fmt: skip
     return table("Total Lagrangian, the walker on ground, by size, one thread", header, rows)
 
 

@@ -9,6 +9,7 @@ from mpmopt.design.objective import Objective
 from mpmopt.scene import Grid, Material, Mirror, Scene, Solid
 from mpmopt.scene.particles import discretise, of_solid
 from mpmopt.simulation.checkpoints import Checkpointing
+from mpmopt.simulation.lagrangian import LagrangianSimulation
 from mpmopt.simulation.simulation import Simulation
 from mpmopt.simulation.surroundings import parameters_of
 
@@ -17,6 +18,10 @@ def solid_simulation(scene, particles=None, state=None, precision="double"):
     particles = particles or discretise(scene)
     ones = np.ones(len(particles.position))
     signal = np.zeros((scene.steps, len(scene.actuators)))
+    if scene.formulation == "total":  # begins at rest
+        return LagrangianSimulation(
+            scene, particles, of_solid(scene, particles, "density"), ones, signal
+        )  # fmt: skip
     return Simulation(
         scene, particles, of_solid(scene, particles, "density"), ones, signal, state, precision
     )  # fmt: skip
@@ -48,6 +53,8 @@ class Bar:
     precision : {"double", "single"}, optional
     viscosity : float, optional
         eta, which makes the middle move by `damped` times as much.
+    formulation : {"updated", "total"}, optional
+        As in `Scene`.
     """
 
     length = 25.0
@@ -57,7 +64,7 @@ class Bar:
 
     def __init__(
         self, n, courant, per_cell=2, checkpointing=None, precision="double",
-        viscosity=0.0,
+        viscosity=0.0, formulation="updated",
     ):  # fmt: skip
         dx = self.length / n
         free, held = 4 * dx, 4 * dx + self.length
@@ -67,6 +74,7 @@ class Bar:
             material=Material(0.0, self.speed**2 / 2.0, viscosity=viscosity),
             body=(Solid((free, 4 * dx), (held + self.length, 6 * dx)),),
             particles_per_cell=per_cell, mirror=Mirror("x", held), direction=(0.0, 1.0),
+            formulation=formulation,
         )  # fmt: skip
         particles = discretise(scene)
         beta = math.pi / (2.0 * self.length)
@@ -78,7 +86,15 @@ class Bar:
         self.state[4] = self.amplitude * beta * np.cos(s)
         self.state[8] = 1.0 / (1.0 + scene.time_step * self.state[4])
         self.middle = -free - self.length / 2.0
-        self.simulation = solid_simulation(scene, particles, self.state, precision)
+        if formulation == "total":
+            self.simulation = solid_simulation(scene, particles)
+            start, there = self.simulation.start, self.simulation.lattice.mass > 0.0
+            # A spline through sin(beta x) has control points on it that are this much larger.
+            larger = 1.0 / (0.75 + 0.25 * math.cos(beta * dx))
+            sine = np.sin(beta * (held - start[0]))
+            start[2] = np.where(there, -larger * self.amplitude * sine, 0.0)
+        else:
+            self.simulation = solid_simulation(scene, particles, self.state, precision)
         self.objective = Objective.of(scene, particles, (-1.0, 0.0))
         self.checkpointing = checkpointing or Checkpointing()
 
@@ -104,6 +120,9 @@ class Bar:
             bar = forward.reverse(self.objective.terminal_adjoints(forward.states))
         by_mu = bar.stiffness.sum()  # lambda is zero
         strain = simulation.scene.time_step * state[4]
+        if simulation.scene.formulation == "total":
+            by_v0 = bar.state[2:] * simulation.start[2:]
+            return value - self.middle, np.array([by_mu, by_v0.sum()])
         by_v0 = bar.state[[2, 4, 8]] * [state[2], state[4], -strain / (1.0 + strain) ** 2]
         return value - self.middle, np.array([by_mu, by_v0.sum()])
 

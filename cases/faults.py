@@ -2,9 +2,9 @@
 
     python cases/faults.py --out out/faults [--quick]
 
-Each run is a small walker with four starts, three stages. It counts as survived
-if it ends, gone on with after the fault, in the same file as a run that nothing happened to, number
-by number; only the seconds differ.
+Each run is a small walker, three stages, or a body in three scenes with two constraints. It counts
+as survived if it ends, gone on with after the fault, in the same file as a run that nothing
+happened to, number by number; only the seconds differ.
 """
 
 from __future__ import annotations
@@ -35,10 +35,16 @@ import mpmopt
 from mpmopt.app import case
 from mpmopt.app.summary import table
 from mpmopt.app.sweeps import as_csv
+from mpmopt.assess.threshold import solid_reference
+from mpmopt.design.one_piece import OnePiece
+from mpmopt.design.task import AtMost, Task
+from mpmopt.design.terms import Displacement, Effort, Volume
+from mpmopt.design.variation import Variation
 from mpmopt.io.console import how_to_go_on, reported
 from mpmopt.io.files import replace_file
 from mpmopt.optimisation.settings import Settings, Stage
 from mpmopt.results import runfile
+from mpmopt.scene import Actuator, Design, Grid, Ground, Material, Scene, Solid
 from mpmopt.simulation import buffers, simulation
 from mpmopt.simulation.checkpoints import Checkpointing
 
@@ -56,6 +62,36 @@ SMALL = case.Case(
     ),
     slanted_legs,
 )
+C = 1 / 32
+# In three scenes, one of them in the other formulation, and with two constraints.
+ENSEMBLE = case.Case(
+    Scene(
+        Grid((32, 24), C),
+        time_step=1e-3,
+        steps=200,
+        body=(
+            Design((4 * C, 4 * C), (12 * C, 8 * C)),
+            Actuator((4 * C, 8 * C), (10 * C, 10 * C)),
+            Solid((10 * C, 8 * C), (12 * C, 10 * C)),
+        ),
+        gravity=(0.0, -10.0),
+        ground=(Ground.floor(3.2 * C, thickness=C),),
+        material=Material(viscosity=0.02),
+    ),
+    Settings((Stage(2.0, move_limit=0.1), Stage(8.0, solid=True)), most_iterations=6),
+    solid_reference,
+    task=Task(
+        Displacement() - 0.01 * Effort(),
+        (AtMost(OnePiece(), 0.0), AtMost(Volume(), 0.6)),
+        (
+            Variation(friction=0.3, threshold=0.4),
+            Variation(thickness=1.25, formulation="total"),
+            Variation(friction="stick", strength=1.1, threshold=0.6),
+        ),
+        soft_minimum=30.0,
+    ),
+)
+CASES = {"walker": SMALL, "ensemble": ENSEMBLE}
 PHASES = {"advance": b"forward", "advance_adjoint": b"reverse", "write": b"write"}
 
 
@@ -88,8 +124,8 @@ def content(path: Path) -> dict[str, Any]:
     return found
 
 
-def child(out: Path, phase: Path | None, on_disk: bool) -> int:
-    """Run the small walker as its case script does, telling in a file what it is at."""
+def child(name: str, out: Path, phase: Path | None, on_disk: bool) -> int:
+    """Run one of `CASES` as a case script does, telling in a file what it is at."""
     if phase is not None:
         handle = os.open(phase, os.O_WRONLY | os.O_CREAT)
 
@@ -108,13 +144,13 @@ def child(out: Path, phase: Path | None, on_disk: bool) -> int:
         runfile.replace_file = telling(runfile.replace_file, lambda *a: "write")
     checkpointing = Checkpointing(every=7, store="disk") if on_disk else None
     return reported(
-        lambda: print(table(case.run(SMALL, out, checkpointing))),
+        lambda: print(table(case.run(CASES[name], out, checkpointing))),
         lambda: how_to_go_on(out / "run.h5"),
     )
 
 
 class Process:
-    """The small walker in a process of its own."""
+    """One of `CASES`, by default the small walker, in a process of its own."""
 
     def __init__(self, out: Path, *options: str, **settings: Any) -> None:
         self.out, self.phase = out, out.with_suffix(".phase")
@@ -156,24 +192,32 @@ def resumed(out: Path) -> dict[str, Any]:
     return content(out / "run.h5")
 
 
-def finished(out: Path, **settings: Any) -> dict[str, Any]:
+def finished(out: Path, *options: str, **settings: Any) -> dict[str, Any]:
     """The content of a run that nothing happens to, or nothing more."""
-    code, text = Process(out, **settings).end()
+    code, text = Process(out, *options, **settings).end()
     assert code == 0, text
     return content(out / "run.h5")
 
 
-def kills(folder: Path, whole: dict[str, Any], count: int, dice: random.Random) -> list[Row]:
+def on_one_processor() -> None:
+    """Let this process have one only, where the system can do that."""
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+
+
+def kills(
+    folder: Path, whole: dict[str, Any], count: int, dice: random.Random, name: str = "walker"
+) -> list[Row]:
     """SIGKILL at random moments: in the forward run, on the way back, in a write, wherever."""
     where: dict[str, list[int]] = {}
     run = 0
     while count > 0:
-        out = folder / f"killed-{run}"
+        out = folder / f"killed-{name}-{run}"
         run += 1
         at: list[str] = []
         alive = True
         while alive and len(at) < 4 and count > 0:
-            process = Process(out)
+            process = Process(out, f"--case={name}")
             begun = process.wait_for("forward")
             wanted = dice.choice(("forward", "reverse", "write", "anything"))
             time.sleep(dice.uniform(0.0, 1.0))
@@ -190,7 +234,24 @@ def kills(folder: Path, whole: dict[str, Any], count: int, dice: random.Random) 
             done[0] += 1
             done[1] += same
         show(f"{run} runs, {count} kills left")
-    return [Row(f"SIGKILL in {phase}", done[0], done[1]) for phase, done in sorted(where.items())]
+    of = "" if name == "walker" else f", {name}"
+    return [
+        Row(f"SIGKILL in {phase}{of}", done[0], done[1]) for phase, done in sorted(where.items())
+    ]
+
+
+def ensembles(folder: Path, count: int, dice: random.Random) -> list[Row]:
+    """The run in three scenes with two constraints: other threads and processors, and SIGKILL."""
+    whole = finished(folder / "ensemble", "--case=ensemble", environment={"MPMOPT_THREADS": "1"})
+    two = {"MPMOPT_THREADS": "2"}
+    others = [
+        finished(folder / "ensemble-2", "--case=ensemble", environment=two),
+        finished(folder / "ensemble-alone", "--case=ensemble", environment=two,
+                 preexec_fn=on_one_processor),
+    ]  # fmt: skip
+    same = sum(other == whole for other in others)
+    rows = [Row("nothing, two threads or one processor, ensemble", len(others), same)]
+    return rows + kills(folder, whole, count, dice, "ensemble")
 
 
 def signals(folder: Path, whole: dict[str, Any], dice: random.Random, count: int) -> list[Row]:
@@ -377,6 +438,7 @@ def campaign(folder: Path, quick: bool) -> list[Row]:
     again = finished(folder / "again", environment={"MPMOPT_THREADS": "2"})
     rows = [Row("nothing, with two threads", 1, int(again == whole))]
     rows += kills(folder, whole, 8 if quick else 100, dice)
+    rows += ensembles(folder, 2 if quick else 30, dice)
     rows += signals(folder, whole, dice, 1 if quick else 5)
     rows += full_disk(folder, whole, 2 if quick else 10, dice)
     rows += scratch(folder, whole)
@@ -392,11 +454,12 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of results")
     parser.add_argument("--quick", action="store_true", help="a few of each kind")
     parser.add_argument("--child", action="store_true", help=argparse.SUPPRESS)
+    parser.add_argument("--case", choices=CASES, default="walker", help=argparse.SUPPRESS)
     parser.add_argument("--phase", type=Path, help=argparse.SUPPRESS)
     parser.add_argument("--on-disk", action="store_true", help=argparse.SUPPRESS)
     arguments = parser.parse_args(argv)
     if arguments.child:
-        return child(arguments.out, arguments.phase, arguments.on_disk)
+        return child(arguments.case, arguments.out, arguments.phase, arguments.on_disk)
     arguments.out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=arguments.out, ignore_cleanup_errors=True) as folder:
         rows = campaign(Path(folder), arguments.quick)

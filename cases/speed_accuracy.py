@@ -2,11 +2,12 @@
 
     python cases/speed_accuracy.py --out DIR [--quick] [--peers] [--scheduler ADDRESS]
 
-Sweeps cells, Courant number, particles per cell, precision, checkpoints and transfer. The bar has
-an exact answer; crawler and walker, on a wall and on a layer, are designs given as functions of
-position, so that every resolution sees the same robot, and are compared with the finest that is
-affordable. Writes
-``speed_accuracy.csv``, ``.h5`` and ``.png``, and the tables of the documentation. What
+Sweeps cells, Courant number, particles per cell, precision, checkpoints and formulation. The bar
+has an exact answer; crawler and walker, on walls and on ground with a layer, are designs given as
+functions of position, so that every resolution sees the same robot, and are compared with the
+finest that is affordable in the same formulation. On ground there are both, and how far the finest
+of both are apart is a number of its own. Writes ``speed_accuracy.csv``, ``.h5`` and ``.png``, and
+the tables of the documentation, one of which has the time at equal accuracy. What
 ``speed_accuracy_points.h5`` holds already is not measured again. `--peers` adds Taichi in both
 precisions and Warp at the paper's setting. The workers of a cluster must be alike, and each have a
 processor of its own: what counts is their processor time.
@@ -43,8 +44,9 @@ from mpmopt.assess.discretisation import Discretisation, Measured, density, meas
 from mpmopt.design.actuation import signal_adjoint
 from mpmopt.design.objective import Objective
 from mpmopt.design.problem import Problem
-from mpmopt.errors import MpmoptError
-from mpmopt.scene import Ground, Scene
+from mpmopt.errors import MpmoptError, SceneError
+from mpmopt.scene import Material, Scene
+from mpmopt.scene.scene import Formulation
 from mpmopt.simulation.checkpoints import Checkpointing
 
 BETA = 8.0
@@ -84,20 +86,28 @@ def lasting(scene: Scene, duration: float) -> Scene:
     return replace(scene, steps=round(duration / scene.time_step))
 
 
-def on_layer(scene: Scene) -> Scene:
-    """The walker on ground with a layer in the place of its wall, and of a viscous material."""
-    (wall,) = scene.walls
-    ground = Ground.floor(wall.position, friction=0.5, thickness=C)
-    material = replace(scene.material, viscosity=0.02)
-    return replace(scene, walls=(), ground=(ground,), material=material)
+def on_ground(scene: Scene) -> Scene:
+    """A robot on ground, whose travel counts from the start, and whose filter is as on walls."""
+    material = Material(viscosity=0.02, **FLOORS)
+    scene = replace(scene, transient=0.0, filter_length=0.0, material=material)
+    return lasting(replace(scene, formulation="updated"), DURATION)
+
+
+def walker_phi_on_ground(position: np.ndarray) -> np.ndarray:
+    """The same legs; the body stands farther from the edge."""
+    return walker_phi(position - np.array([walker.AHEAD, 0.0]))
 
 
 # The paper's cells and step.
 ROBOTS: dict[str, tuple[Scene, Callable[[np.ndarray], np.ndarray]]] = {
     "walker": (lasting(walker.walker(128, 2e-4).vary(**FLOORS), DURATION), walker_phi),
     "crawler": (lasting(crawler.crawler(128, 2e-4).vary(**FLOORS), DURATION), crawler_phi),
+    "walker on ground": (
+        on_ground(walker.walker_on_ground(128, 2e-4, 2.0)),
+        walker_phi_on_ground,
+    ),
+    "crawler on ground": (on_ground(crawler.crawler_on_ground(128, 2e-4, 2.0)), crawler_phi),
 }
-ROBOTS["walker on a layer"] = on_layer(ROBOTS["walker"][0]), walker_phi
 
 
 def design(phi: Callable[[np.ndarray], np.ndarray]) -> Callable[[Problem], np.ndarray]:
@@ -119,6 +129,7 @@ class Choice:
     per_cell: int = 2
     precision: Literal["double", "single"] = "double"
     memory: int = 256_000_000
+    formulation: Formulation = "updated"
 
 
 PLAIN = Choice("2 x 2 a cell, double", "o")
@@ -126,6 +137,8 @@ MORE_PARTICLES = Choice("3 x 3 a cell", "s", per_cell=3)
 SINGLE = Choice("single precision", "^", precision="single")
 LITTLE_MEMORY = Choice("64 MB of states", "v", memory=64_000_000)
 ALL_KEPT = Choice("all states kept", "P", memory=2**33)
+TOTAL = Choice("total Lagrangian", "D", formulation="total")
+SWEPT = (PLAIN.name, TOTAL.name)  # over cells and Courant numbers
 PEERS = {
     "Taichi, double": ("taichi_mpm", "taichi", "*"),
     "Taichi, single": ("taichi_mpm", "taichi", "h"),
@@ -164,6 +177,10 @@ class Point:
     travel_error: float = math.nan
     gradient_error: float = math.nan
     angle: float = math.nan
+
+    @property
+    def formulation(self) -> Formulation:
+        return self.measured.discretisation.formulation
 
     def against(self, reference: Measured) -> "Point":
         """The same with its errors."""
@@ -204,35 +221,52 @@ def settings(quick: bool) -> list[tuple[int, float, Choice]]:
     if not quick:
         points += [PAPER, (256, 0.4, MORE_PARTICLES)]
         points += [(n, 0.8, SINGLE) for n in (64, 128, 256)]
+    points += [(n, courant, TOTAL) for n, courant, choice in points if choice is PLAIN]
     return points
 
 
-COURANTS = (0.05, 0.1, 0.2, 0.4, 0.6, 0.8)
+COURANTS = (0.05, 0.1, 0.2, 0.3, 0.4, 0.6, 0.8)
 PAPER = (128, ROBOTS["walker"][0].courant, PLAIN)
 RECOMMENDED = (128, 0.6, PLAIN)
 # The reference is at the Courant number of the recommended setting.
 REFERENCE, QUICK_REFERENCE = (384, 0.6, PLAIN), (128, 0.6, PLAIN)
 
 
-def is_possible(name: str, n: int, courant: float) -> bool:
-    """Whether a scene allows such a step: viscosity shortens it, the more so on finer cells."""
-    if name == "bar":
-        return True
-    scene, dx = ROBOTS[name][0], 1.0 / n
-    return courant <= scene.wave_speed * scene.material.largest_time_step(dx) / dx
+def is_possible(name: str, n: int, courant: float, choice: Choice) -> bool:
+    """Whether a scene can be laid out so: on fine cells viscosity shortens the step.
+
+    In the total Lagrangian formulation steps are shorter still, and there are no walls.
+    """
+    try:
+        if name == "bar":
+            Bar(n, courant, formulation=choice.formulation)
+        else:
+            laid_out(ROBOTS[name][0], n, courant, choice).scene(ROBOTS[name][0])
+    except SceneError:
+        return False
+    return True
+
+
+def laid_out(scene: Scene, n: int, courant: float, choice: Choice) -> Discretisation:
+    """A robot's scene with n cells along a unit of length."""
+    return Discretisation.of(
+        scene, n / scene.grid.cells[1], courant, particles_per_cell=choice.per_cell,
+        precision=choice.precision, formulation=choice.formulation,
+    )  # fmt: skip
 
 
 def nearest_possible(name: str, point: tuple[int, float, Choice]) -> tuple[int, float, Choice]:
     """The same with the next Courant number below that a scene allows."""
     n, courant, choice = point
-    allowed = (c for c in COURANTS[::-1] if c <= courant and is_possible(name, n, c))
+    allowed = (c for c in COURANTS[::-1] if c <= courant and is_possible(name, n, c, choice))
     return n, next(allowed), choice
 
 
 def measure_bar(n: int, courant: float, choice: Choice) -> Measured:
     """The bar in one discretisation."""
     bar = Bar(
-        n, courant, choice.per_cell, Checkpointing(memory=choice.memory), choice.precision
+        n, courant, choice.per_cell, Checkpointing(memory=choice.memory), choice.precision,
+        formulation=choice.formulation,
     )  # fmt: skip
     scene = bar.simulation.scene
     here = replace(Discretisation.of(scene), precision=choice.precision)
@@ -247,13 +281,9 @@ def measure_bar(n: int, courant: float, choice: Choice) -> Measured:
 def measure_robot(name: str, scene: Scene, n: int, courant: float, choice: Choice) -> Measured:
     """A robot in one discretisation."""
     _, phi = ROBOTS[name]
-    here = Discretisation.of(
-        scene, n / scene.grid.cells[0], courant,
-        particles_per_cell=choice.per_cell, precision=choice.precision,
-    )  # fmt: skip
     return measure(
-        scene, here, design(phi), BETA, PATCH,
-        checkpointing=Checkpointing(memory=choice.memory), repeats=2,
+        scene, laid_out(scene, n, courant, choice), design(phi), BETA, PATCH,
+        checkpointing=Checkpointing(memory=choice.memory), repeats=2 if n < 256 else 1,
     )  # fmt: skip
 
 
@@ -307,8 +337,10 @@ class Bench:
         ]  # fmt: skip
         outcomes = sweep(measure_point, wanted, self.store, self.executor, workers=1)
         return [
-            Measured(Discretisation((n, n), row.pop("steps")), **row)
-            for (_, n, _, _), row in zip(points, results(outcomes), strict=True)
+            Measured(
+                Discretisation((n, n), row.pop("steps"), formulation=choice.formulation), **row
+            )
+            for (_, n, _, choice), row in zip(points, results(outcomes), strict=True)
         ]
 
     def run(self, points: Sequence[tuple[str, int, float, Choice]]) -> list[Point]:
@@ -389,19 +421,26 @@ def print_peer(name: str, robot: str) -> None:
 
 def horizons(bench: Bench) -> list[dict[str, str]]:
     """How the gradient's error grows with the simulated time: n = 64 and 128 against 256."""
-    where = [(name, duration) for name in ROBOTS for duration in (0.25, 0.5, 1.0)]
+    finest = {
+        robot: nearest_possible(
+            robot[0], (*REFERENCE[:2], PLAIN if robot[1] == "updated" else TOTAL)
+        )
+        for robot in robots()
+    }
+    where = [(robot, duration) for robot in finest for duration in (0.25, 0.5, 1.0)]
     cells = (64, 128, 256)
-    courants = {name: nearest_possible(name, REFERENCE)[1] for name in ROBOTS}
     measured = iter(
         bench.measure(
-            [(name, n, courants[name], PLAIN) for name, _ in where for n in cells],
-            [lasting(ROBOTS[name][0], duration) for name, duration in where for _ in cells],
+            [(robot[0], n, *finest[robot][1:]) for robot, _ in where for n in cells],
+            [lasting(ROBOTS[robot[0]][0], duration) for robot, duration in where for _ in cells],
         )
     )
     rows = []
-    for name, duration in where:
+    for (name, formulation), duration in where:
         coarse, middle, fine = (next(measured) for _ in cells)
-        row = {"robot": name, "seconds simulated": f"{duration:g}"}
+        row = {
+            "robot": name, "formulation": formulation, "seconds simulated": f"{duration:g}",
+        }  # fmt: skip
         for n, one in ((64, coarse), (128, middle)):
             travel, gradient, angle = one.errors(fine)
             row[f"travel, n = {n}"] = f"{travel:.0%}"
@@ -424,21 +463,79 @@ def manufactured() -> list[dict[str, str]]:
 
 
 def travels(points: Sequence[Point]) -> list[dict[str, str]]:
-    """Distance by step, over the reference's: one line for each robot and n."""
+    """Distance by step, over the reference's: one line for each robot, formulation and n."""
     rows = []
-    for name in ROBOTS:
+    for name, formulation in robots():
         for n in sorted({p.n for p in points}):
             line = {
                 p.courant: p.travel_ratio
                 for p in points
-                if (p.scene, p.choice, p.n) == (name, PLAIN.name, n) and not p.measured.failure
+                if (p.scene, p.formulation, p.n) == (name, formulation, n)
+                and p.choice in SWEPT
+                and not p.measured.failure
             }
             if not line:
                 continue
-            row = {"robot": name, "n": str(n)}
+            row = {"robot": name, "formulation": formulation, "n": str(n)}
             for courant in COURANTS:
                 row[f"{courant:g}"] = f"{line[courant]:.3f}" if courant in line else ""
             rows.append(row)
+    return rows
+
+
+def robots() -> list[tuple[str, Formulation]]:
+    """Robots, in all formulations that their scenes allow."""
+    both: tuple[Formulation, ...] = ("updated", "total")
+    return [
+        (name, formulation)
+        for name, (scene, _) in ROBOTS.items()
+        for formulation in both
+        if formulation == "updated" or not scene.walls
+    ]
+
+
+def enough(points: Sequence[Point], error: float) -> Point | None:
+    """The fastest of some points that is off by at most so much, and not by chance.
+
+    The same with finer cells must be so too, as in `discretisation.cheapest`.
+    """
+    own = [p for p in points if p.choice not in PEERS and p.measured.seconds > 0.0]
+
+    def reached(point: Point) -> bool:
+        return point.travel_error <= error and all(
+            other.travel_error <= error
+            for other in own
+            if other.n > point.n and (other.courant, other.choice) == (point.courant, point.choice)
+        )
+
+    return min(filter(reached, own), key=lambda p: p.measured.seconds, default=None)
+
+
+def at_equal_accuracy(points: Sequence[Point], apart: dict[str, float]) -> list[dict[str, str]]:
+    """What a distance of a given accuracy costs in both formulations."""
+    rows = []
+    for name in apart:
+        for error in (0.2, 0.15, 0.1, 0.05, 0.02, 0.01, 0.005, 0.001):
+            row = {"scene": name, "off by at most": f"{100.0 * error:g} %"}
+            found = []
+            for formulation in ("updated", "total"):
+                best = enough(
+                    [p for p in points if (p.scene, p.formulation) == (name, formulation)], error
+                )
+                found.append(best)
+                row[formulation] = (
+                    f"n = {best.n}, Courant {best.courant:g}, {best.choice}" if best else "none"
+                )
+                row[f"{formulation}, s"] = f"{best.measured.seconds:.3g}" if best else ""
+            updated, total = found
+            row["times"] = (
+                f"{updated.measured.seconds / total.measured.seconds:.1f}"
+                if updated and total
+                else ""
+            )
+            row["references apart"] = f"{apart[name]:.1%}"
+            if updated or total:
+                rows.append(row)
     return rows
 
 
@@ -458,13 +555,15 @@ def machine() -> str:
     return f"{datetime.date.today()}, one thread of {processor()}, {versions}"
 
 
-def write_h5(path: Path, points: Sequence[Point], references: dict[str, Measured]) -> None:
-    """All numbers, and the gradients as densities."""
+def write_h5(
+    path: Path, points: Sequence[Point], references: dict[tuple[str, Formulation], Measured]
+) -> None:
+    """All numbers, and the gradients as densities: a group for each scene and formulation."""
     with h5py.File(path, "w") as file:
         file.attrs["machine"] = machine()
-        for name, reference in references.items():
-            mine = [p for p in points if p.scene == name]
-            group = file.create_group(name)
+        for (name, formulation), reference in references.items():
+            mine = [p for p in points if (p.scene, p.formulation) == (name, formulation)]
+            group = file.create_group(f"{name}, {formulation}")
             group.attrs["reference travel"] = reference.travel
             group.create_dataset("reference gradient", data=reference.gradient)
             columns = {
@@ -485,12 +584,14 @@ def write_h5(path: Path, points: Sequence[Point], references: dict[str, Measured
             group.create_dataset("gradient", data=np.array(gradients))
 
 
+STYLES = {PLAIN.name: "-", TOTAL.name: ":"}
 COLOURS = {32: "#9e9e9e", 64: "#1f77b4", 128: "#e07b00", 256: "#2a9d3a"}
 TITLES = {
     "bar": "(a) vibrating bar, against the exact answer",
     "walker": "(b) walker",
     "crawler": "(c) crawler",
-    "walker on a layer": "(d) walker on a layer, viscous",
+    "walker on ground": "(d) walker on ground, viscous",
+    "crawler on ground": "(e) crawler on ground, viscous",
 }
 
 
@@ -510,9 +611,11 @@ def draw(path: Path, points: Sequence[Point], known: dict[str, tuple[float, floa
     from matplotlib import pyplot as plt
     from matplotlib.lines import Line2D
 
-    markers = {c.name: c.marker for c in (PLAIN, MORE_PARTICLES, SINGLE, LITTLE_MEMORY, ALL_KEPT)}
+    markers = {
+        c.name: c.marker for c in (PLAIN, TOTAL, MORE_PARTICLES, SINGLE, LITTLE_MEMORY, ALL_KEPT)
+    }
     markers.update({name: marker for name, (_, _, marker) in PEERS.items()})
-    figure, axes = plt.subplots(3, len(TITLES), figsize=(5.3 * len(TITLES), 14.5))
+    figure, axes = plt.subplots(3, len(TITLES), figsize=(4.9 * len(TITLES), 14.5))
     for column, (name, title) in enumerate(TITLES.items()):
         mine = [p for p in points if p.scene == name and not p.measured.failure]
         for row, (error, what) in enumerate(
@@ -551,16 +654,18 @@ def _scatter(
 
     ax.loglog()
     for n, colour in COLOURS.items():
-        line = sorted(
-            (p for p in points if p.n == n and p.choice == PLAIN.name), key=lambda p: p.courant
-        )
-        where = [(p.measured.seconds, getattr(p, error)) for p in line]
-        ax.plot(*zip(*where) if where else ([], []), color=colour, lw=0.8, alpha=0.6, zorder=1)
+        for name, style in STYLES.items():
+            line = sorted(
+                (p for p in points if p.n == n and p.choice == name), key=lambda p: p.courant
+            )
+            where = [(p.measured.seconds, getattr(p, error)) for p in line]
+            line_of = zip(*where) if where else ([], [])
+            ax.plot(*line_of, style, color=colour, lw=0.8, alpha=0.6, zorder=1)
     for p in points:
         big = p.choice in PEERS
         ax.plot(
             p.measured.seconds, getattr(p, error), markers[p.choice], ms=11 if big else 7,
-            mfc=COLOURS[p.n] if p.choice == PLAIN.name or big else "white", mec=COLOURS[p.n],
+            mfc=COLOURS[p.n] if p.choice in SWEPT or big else "white", mec=COLOURS[p.n],
             mew=1.3, zorder=4 if big else 3,
         )  # fmt: skip
     best = front(points, error)
@@ -601,11 +706,12 @@ def _scatter(
 def _steps(ax, points: Sequence[Point]) -> None:
     """Distance by Courant number, the reference's being one."""
     for n, colour in COLOURS.items():
-        line = sorted(
-            (p.courant, p.travel_ratio) for p in points if p.n == n and p.choice == PLAIN.name
-        )
-        if line:
-            ax.plot(*zip(*line), "-o", color=colour, ms=5, lw=1.2)
+        for choice, style in STYLES.items():
+            line = sorted(
+                (p.courant, p.travel_ratio) for p in points if (p.n, p.choice) == (n, choice)
+            )
+            mark = "o" if choice == PLAIN.name else "D"
+            ax.plot(*zip(*line) if line else ([], []), style + mark, color=colour, ms=5, lw=1.2)
     ax.axhline(1.0, color="black", lw=0.8)
     ax.set_xscale("log")
     ax.set_xticks(COURANTS, [f"{c:g}" for c in COURANTS])
@@ -645,34 +751,62 @@ def chart(path: Path, bench: Bench, quick: bool, peers: bool) -> None:
     wanted = settings(quick)
     finest = QUICK_REFERENCE if quick else REFERENCE
     points = bench.run(
-        [(name, *point) for name in TITLES for point in wanted if is_possible(name, *point[:2])]
+        [(name, *point) for name in TITLES for point in wanted if is_possible(name, *point)]
     )
-    references, known = {"bar": exact_bar()}, {"bar": (0.0, 0.0)}
-    best = {name: nearest_possible(name, finest) for name in ROBOTS}
-    references |= dict(zip(ROBOTS, bench.measure([(name, *best[name]) for name in ROBOTS])))
-    for name, (_, courant, _) in best.items():
-        same = [p for p in points if (p.scene, p.choice) == (name, PLAIN.name)]
+    references: dict[tuple[str, Formulation], Measured] = {
+        ("bar", "updated"): exact_bar(), ("bar", "total"): exact_bar(),
+    }  # fmt: skip
+    best = {
+        (name, formulation): nearest_possible(
+            name, (*finest[:2], PLAIN if formulation == "updated" else TOTAL)
+        )
+        for name, formulation in robots()
+    }
+    measured = bench.measure([(robot[0], *point) for robot, point in best.items()])
+    references |= dict(zip(best, measured))
+    known: dict[tuple[str, Formulation], tuple[float, float]] = {
+        ("bar", "updated"): (0.0, 0.0), ("bar", "total"): (0.0, 0.0),
+    }  # fmt: skip
+    apart = {"bar": 0.0}
+    for (name, formulation), (_, courant, choice) in best.items():
+        same = [p for p in points if (p.scene, p.choice) == (name, choice.name)]
         next_best = min(same, key=lambda p: (-p.n, abs(p.courant - courant)))
-        travel, gradient, _ = next_best.measured.errors(references[name])
-        known[name] = travel, gradient
+        travel, gradient, _ = next_best.measured.errors(references[name, formulation])
+        known[name, formulation] = travel, gradient
+        if formulation == "total":
+            differ = references[name, "total"].errors(references[name, "updated"])
+            apart[name] = differ[0]
+            print(
+                f"{name}: references of both formulations {differ[0]:.2%} of travel and "
+                f"{differ[1]:.1%} of the gradient apart"
+            )
     if peers:  # they know walls
         walled = [name for name, (scene, _) in ROBOTS.items() if not scene.ground]
         points += [peer_point(name, robot) for robot in walled for name in PEERS]
-    points = [p.against(references[p.scene]) for p in points]
+    points = [p.against(references[p.scene, p.formulation]) for p in points]
     write_csv(Path(f"{path}.csv"), [p.row() for p in points])
     write_csv(Path(f"{path}_travel.csv"), travels(points))
     fronts = [
         p for name in TITLES for p in front([q for q in points if q.scene == name], "travel_error")
     ]
     write_csv(Path(f"{path}_front.csv"), [p.row() for p in fronts])
+    write_csv(Path(f"{path}_equal.csv"), at_equal_accuracy(points, apart))
     if not quick:
         write_csv(Path(f"{path}_horizon.csv"), horizons(bench))
         write_csv(Path(f"{path}_manufactured.csv"), manufactured())
     write_h5(Path(f"{path}.h5"), points, references)
-    draw(Path(f"{path}.png"), points, known)
+    unknown = {
+        scene: (max(v[0] for k, v in known.items() if k[0] == scene),
+                max(v[1] for k, v in known.items() if k[0] == scene))
+        for scene in TITLES
+    }  # fmt: skip
+    draw(Path(f"{path}.png"), points, unknown)
     print(machine())
-    for name, (travel, gradient) in known.items():
-        print(f"{name}: reference known to {travel:.1%} of travel, {gradient:.0%} of the gradient")
+    for (scene, which), (travel, gradient) in known.items():
+        print(
+            f"{scene}, {which}: reference known to {travel:.1%} of travel, "
+            f"{gradient:.0%} of the gradient"
+        )
 
 
 def exact_bar() -> Measured:

@@ -1,6 +1,9 @@
-"""The walker on other ground than a level floor: a slope, a step, rough ground.
+"""A robot that crosses rough ground: the walker's body, designed on three grounds at once.
 
-python cases/terrain.py --slope --out DIR
+    python cases/terrain.py --preview --out DIR
+
+Hollows are up to two cells deep, that is more than a quarter of a leg's height. What it is judged
+on is a fourth ground, which no scene of the optimisation has. `slope` and `step` are other shapes.
 """
 
 import sys
@@ -9,16 +12,24 @@ from dataclasses import replace
 import numpy as np
 import walker
 
+from mpmopt.app.case import Case
 from mpmopt.app.script import main
+from mpmopt.optimisation.presets import gait
 from mpmopt.scene import Ground, Scene
 
 C = 1 / 64
 FLAT = walker.CASES["preview"].scene
+NEAR, FAR = 1.5, 5.0  # how far rough ground goes, for designs and for robots that are followed
 
 
-def on(ground: Ground) -> Scene:
-    """The walker of the preview on ground of another shape, with its friction and its layer."""
-    return replace(FLAT, ground=(replace(FLAT.ground[0], points=ground.points),))
+def on(ground: Ground, scene: Scene = FLAT) -> Scene:
+    """The walker on ground of another shape, with its friction and its layer."""
+    return replace(scene, ground=(like_flat(ground),))
+
+
+def like_flat(ground: Ground) -> Ground:
+    """Ground of another shape with the walker's friction and layer."""
+    return replace(FLAT.ground[0], points=ground.points)
 
 
 def slope(degrees: float = 5.0) -> Scene:
@@ -33,16 +44,36 @@ def step(height: float = C) -> Scene:
     return on(Ground(((0.0, 3 * C), (34 * C, 3 * C), (34 * C, up), (35 * C, up))))
 
 
-def rough(depth: float = C / 2) -> Scene:
-    """Hills and hollows, every two cells, of which no hill is above the walker's floor."""
-    heights = 3 * C - depth * np.random.default_rng(0).uniform(0.0, 1.0, 49)
-    return on(Ground.heights(np.linspace(0.0, 1.5, 49).tolist(), heights.tolist()))
+def hills(seed: int, depth: float = 2 * C, far: float = NEAR) -> Ground:
+    """Hills and hollows, every five cells, of which no hill is above the walker's floor."""
+    places = np.arange(0.0, far, 5 * C)
+    heights = 3 * C - depth * np.random.default_rng(seed).uniform(0.0, 1.0, len(places))
+    return like_flat(Ground.heights(places.tolist(), heights.tolist()))
 
+
+def rough(seed: int = 0, depth: float = 2 * C, scene: Scene = FLAT) -> Scene:
+    """The walker on hills and hollows."""
+    return on(hills(seed, depth, FAR), scene)
+
+
+# As the walker's, but each on other hills.
+TASK = replace(
+    walker.TASK,
+    scenes=tuple(
+        replace(variation, ground=(hills(seed),))
+        for seed, variation in enumerate(walker.TASK.scenes, 1)
+    ),
+)
 
 CASES = {
-    "default": replace(walker.CASES["preview"], scene=rough()),
-    "slope": replace(walker.CASES["preview"], scene=slope()),
-    "step": replace(walker.CASES["preview"], scene=step()),
+    "default": Case(
+        rough(scene=walker.CASES["default"].scene),
+        gait(1e-3, 120),
+        walker.slanted_legs_on_ground,
+        walker.START,
+        TASK,
+    ),
+    "preview": Case(rough(), gait(1e-3, 40), walker.slanted_legs_on_ground, walker.START, TASK),
 }
 
 if __name__ == "__main__":

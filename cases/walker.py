@@ -16,8 +16,11 @@ import numpy as np
 
 from mpmopt.app.case import Case
 from mpmopt.app.script import main
+from mpmopt.design.one_piece import OnePiece
+from mpmopt.design.task import AtMost, Task
+from mpmopt.design.variables import Bounded
 from mpmopt.design.variation import Variation
-from mpmopt.optimisation.presets import IN_ONE_PIECE, gait, paper_preset
+from mpmopt.optimisation.presets import gait, paper_preset
 from mpmopt.scene import Actuator, Design, Grid, Ground, Material, Scene, Solid, Wall
 
 AHEAD = 8 / 64  # of the paper's body is the one on ground
@@ -61,7 +64,7 @@ def walker_on_ground(cells: int, time_step: float, seconds: float) -> Scene:
         material=Material(viscosity=0.03),
         steps=round(seconds / time_step),
         transient=1.0,
-        filter_length=1 / 64,
+        filter_length=2 / 64,
         formulation="total",
     )
 
@@ -78,44 +81,45 @@ def slanted_legs(positions: np.ndarray) -> np.ndarray:
     return np.any([abs(x + foot - top * c) <= 1.25 * c for top in (7, 13, 19)], axis=0)
 
 
-def slanted_legs_on_ground(positions: np.ndarray) -> np.ndarray:
-    """A thin hind leg and a wide front leg that lean back: the best of 200 drawings.
+def two_legs(positions: np.ndarray) -> np.ndarray:
+    """A thin hind leg and a wide front leg that lean back, on a skin under the beam.
 
-    They had legs at other places, of other slants and widths, and other frequencies.
+    One in four of 673 such drawings, with legs of other places, slants and widths and other
+    signals, goes 0.02 a second or more in all scenes of the task, at frequencies from 45 to 55.
     """
     c = 1 / 64
     x, y = positions.T
-    foot = 3.3 * c * (11 * c - y) / (7 * c)
-    return np.any([abs(x - AHEAD + foot - top * c) <= c for top in (12, 20, 21)], axis=0)
+    x, depth = x - AHEAD, 11 * c - y
+    legs = [
+        abs(x + slant * depth / 7 - top * c) <= 0.5 * width * c
+        for top, slant, width in ((8.0, 1.5, 2.5), (19.5, 5.0, 3.5))
+    ]
+    return np.any([*legs, depth <= c], axis=0)
 
 
 def start(positions: np.ndarray) -> np.ndarray:
-    """The drawing, faintly, with a little noise so that nothing is even."""
-    noise = np.random.default_rng(1).uniform(-0.05, 0.05, len(positions))
-    return np.where(slanted_legs_on_ground(positions), 0.8, -0.8) + noise
+    """The drawing, black and white."""
+    return np.where(two_legs(positions), 1.0, -1.0)
 
 
-START = {"phi": start, "omega": 0.9}
+START = {"phi": start, "a": 1.0, "theta": 0.7, "b": -0.4, "omega": 0.8}
 
 # What nobody knows of the world: friction, softness of the ground, strength, and how exactly it was
-# made.
-TASK = replace(
-    IN_ONE_PIECE,
+# made. The actuator is not held squeezed, which would stretch the skin until MLS-MPM tears it.
+TASK = Task(
     scenes=(
         Variation(friction=0.28, strength=0.9, threshold=0.4),
         Variation(friction=0.45, thickness=2.0),
         Variation(friction=0.72, strength=1.1, threshold=0.6),
     ),
+    subject_to=(AtMost(OnePiece(), -0.4),),
+    variables=(Bounded("b", lower=-0.4, upper=0.4),),
     soft_minimum=8.0,
 )
 
 CASES = {
-    "default": Case(
-        walker_on_ground(64, 1e-3, 4.0), gait(1e-3, 120), slanted_legs_on_ground, START, TASK
-    ),
-    "preview": Case(
-        walker_on_ground(64, 1e-3, 3.0), gait(1e-3, 40), slanted_legs_on_ground, START, TASK
-    ),
+    "default": Case(walker_on_ground(64, 1e-3, 4.0), gait(1e-3, 120), two_legs, START, TASK),
+    "preview": Case(walker_on_ground(64, 1e-3, 3.0), gait(1e-3, 40), two_legs, START, TASK),
     "paper": Case(walker(128, 2e-4), paper_preset(2e-4), slanted_legs),
 }
 

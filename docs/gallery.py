@@ -47,7 +47,7 @@ ROWS = {
     "optimised": "Optimised",
     "post_processed": "Post-processed",
     "actuation_off": "The same with its actuation off",
-    "retained_gain": "Gain retained: half, twice the step; finer cells; other formulation",
+    "retained_gain": "Gain retained",
     "disconnected_particles": "Disconnected particles",
     "evaluations": "Evaluations",
     "failed_evaluations": "Failed evaluations",
@@ -72,7 +72,8 @@ def make(name: str, case: Case) -> None:
 def text(value: object) -> str:
     """A value of a summary as the table shows it."""
     if isinstance(value, dict):
-        return "; ".join("none" if v is None else f"{v:.0%}" for v in value.values())
+        shares = {name: "none" if v is None else f"{v:.0%}" for name, v in value.items()}
+        return "; ".join(f"{share} with {name}" for name, share in shares.items())
     return f"{value:.3f}" if isinstance(value, float) else str(value)
 
 

@@ -1,7 +1,11 @@
-"""Commands on the run file that a case script leaves: look at it, check it, take it away.
+"""Robots to make, and commands on the run file that one leaves: look at it, check it, take it away.
+
+robots:
+  walker, crawler, climber, silicone, terrain
+  mpmopt ROBOT --help tells what each can be asked for
 
 examples:
-  python cases/walker.py --preview --out out/walker    make a run
+  mpmopt walker --preview --out out/walker             make a run
   mpmopt report out/walker/run.h5                      one page of all that it found
   mpmopt plot out/walker/run.h5                        pictures of it
   mpmopt film out/walker/run.h5                        and a film
@@ -21,6 +25,7 @@ import argparse
 import logging
 import sys
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from mpmopt import __version__
@@ -29,6 +34,25 @@ from mpmopt.io.console import how_to_go_on, reported
 
 if TYPE_CHECKING:
     from mpmopt.results.runfile import RunFile
+
+ROBOTS = ("walker", "crawler", "climber", "silicone", "terrain")
+
+
+def robot(name: str, arguments: list[str]) -> None:
+    """Run a robot's script, which ends the process, as ``python cases/NAME.py`` does from a clone.
+
+    It is ``__main__`` then, too: what it defines travels to other processes.
+    """
+    package = Path(__file__).parent
+    folder = package / "cases"  # of a wheel
+    if not folder.is_dir():
+        folder = package.parent / "cases"
+    script = folder / f"{name}.py"
+    sys.argv[:] = [f"mpmopt {name}", *arguments]
+    sys.path.insert(0, str(folder))
+    sys.modules["__main__"] = module = ModuleType("__main__")
+    module.__file__ = str(script)
+    exec(compile(script.read_bytes(), script, "exec"), vars(module))
 
 
 def _read(path: Path) -> RunFile:
@@ -285,6 +309,10 @@ def cheapest(path: Path, tol: float, gradient_tol: float | None, seconds: float)
     own = (found.objective_uncertainty, found.gradient_uncertainty)
     travel, gradient = ("unknown" if value != value else f"{value:.1%}" for value in own)
     print(f"its own uncertainty      travel {travel}, gradient {gradient}")
+    if found.other_reference is not None:
+        print(f"other formulation        {found.other_reference.discretisation}")
+        apart = f"travel {found.objective_apart:.1%}, gradient {found.gradient_apart:.1%}"
+        print(f"apart from it            {apart}")
     label = "cheapest near it" if found.doubt else f"cheapest within {tol:.3g}"
     print(f"{label:<24} {found.best}")
     if found.doubt:
@@ -338,6 +366,9 @@ def export(path: Path, out: Path | None, force: bool, **options: Any) -> int:
 
 def main(argv: list[str] | None = None) -> int:
     """Run a command; the exit code is one of those in the module's text."""
+    argv = sys.argv[1:] if argv is None else argv
+    if argv and argv[0] in ROBOTS:
+        robot(argv[0], argv[1:])
     options = vars(_parser().parse_args(argv))
     do, advice = options.pop("do"), options.pop("advice")
     logging.basicConfig(format="%(message)s")
@@ -459,11 +490,11 @@ def _parser() -> argparse.ArgumentParser:
         "study",
         "try its best design elsewhere",
         "Say how much of its gain the best design, without void, keeps with half the step, twice\n"
-        "the step, and cells half as wide: numerical propulsion keeps little. Then, of a robot on\n"
-        "ground, how fast it goes on ground of other frictions, in both formulations on other\n"
-        "cells, with stronger and faster actuators, without actuation and after a push, and for\n"
-        "how long it goes on. The numbers go to the run file and summary.json, and robustness.png\n"
-        "shows them.",
+        "the step where that is stable, cells half as wide, and in the other formulation:\n"
+        "numerical propulsion keeps little. Then, of a robot on ground, how fast it goes on\n"
+        "ground of other frictions, in both formulations on other cells, with stronger and\n"
+        "faster actuators, without actuation and after a push, and for how long it goes on. The\n"
+        "numbers go to the run file and summary.json, and robustness.png shows them.",
         "out/walker/run.h5",
     )
     command.set_defaults(do=study)
@@ -497,7 +528,8 @@ def _parser() -> argparse.ArgumentParser:
         "cheapest",
         "find the cheapest discretisation that is accurate enough",
         "Measure the best design in one discretisation after the other, from the cheapest on,\n"
-        "until travel and gradient agree with the finest that is affordable.",
+        "until travel and gradient agree with the finest that is affordable; in both formulations\n"
+        "where the scene has neither walls nor clamps.",
         "out/walker/run.h5 --tol 0.1",
         "out/walker/run.h5 --tol 0.05 --gradient-tol inf --seconds 300",
     )

@@ -3,10 +3,12 @@
 import dataclasses
 import json
 import os
+import re
 import shlex
 import shutil
 import subprocess
 import sys
+import textwrap
 from pathlib import Path
 
 import climber
@@ -15,7 +17,8 @@ import numpy as np
 import pytest
 from walker import CASES, slanted_legs, walker
 
-from mpmopt.app.case import Case, ProgressBar, most_evaluations, resume, run
+from mpmopt.app import case as one_case
+from mpmopt.app.case import Case, resume, run
 from mpmopt.app.script import main
 from mpmopt.assess.threshold import pieces
 from mpmopt.design.problem import Problem
@@ -27,6 +30,7 @@ from mpmopt.optimisation.presets import IN_ONE_PIECE
 from mpmopt.optimisation.settings import Settings, Stage
 from mpmopt.results import runfile
 from mpmopt.view import plot
+from mpmopt.view.live import ProgressBar, most_evaluations
 
 SMALL = Case(
     walker(64, 8e-4),
@@ -163,6 +167,26 @@ def test_a_picture_that_fails_spoils_no_run(tmp_path, caplog, monkeypatch, how):
     assert json.loads((tmp_path / "summary.json").read_text()) == summary
     assert runfile.read_run(tmp_path / "run.h5").summary == summary
     assert run(TINY, tmp_path) == resume(tmp_path / "run.h5") == summary
+
+
+@pytest.mark.parametrize("full", [True, False])
+def test_a_run_that_was_stopped_is_studied_as_it_would_have_been(tmp_path, monkeypatch, full):
+    def stopped(begun, callbacks, checkpointing):
+        callbacks[0](begun)
+        raise KeyboardInterrupt
+
+    def noted(result, baseline, full_study):
+        asked.append(full_study)
+        return {"evaluations": 0}
+
+    asked: list[bool] = []
+    monkeypatch.setattr(one_case, "RESULTS", ())
+    monkeypatch.setattr(one_case, "summarise", noted)
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(one_case, "go_on", stopped)
+        run(TINY, tmp_path, full_study=full)
+    resume(tmp_path / "run.h5")
+    assert asked == [full]
 
 
 def test_a_start_is_filled_up_and_knows_its_names():
@@ -338,10 +362,10 @@ def test_kernels_come_from_the_cache_to_the_same_bits_but_never_once_edited(tmp_
 
 
 @pytest.mark.case
-def test_the_example_in_the_readme_goes_farther(capsys):
-    text = (ROOT / "README.md").read_text()
-    example = text.split("```python\n")[1].split("```")[0]
-    exec(compile(example, "README.md", "exec"), {})
+def test_the_example_of_the_dozen_names_goes_farther(capsys):
+    text = (ROOT / "docs" / "api.rst").read_text()
+    example = re.split(r"^\S", text.split(".. code-block:: python\n")[1], flags=re.MULTILINE)[0]
+    exec(compile(textwrap.dedent(example), "api.rst", "exec"), {})
     before, after = (float(part) for part in capsys.readouterr().out.split(" -> "))
     assert after >= before + 0.05
 

@@ -14,10 +14,16 @@ from mpmopt.design.chain import (
     filter_matrix,
     interpolate,
     non_discreteness,
-    project,
-    project_adjoint,
 )
 from mpmopt.design.problem import Problem
+from mpmopt.design.projection import (
+    REACH,
+    lattice_differences,
+    project,
+    project_adjoint,
+    project_subpixel,
+    project_subpixel_adjoint,
+)
 from mpmopt.errors import DesignError
 from mpmopt.scene import Design, Grid, Material, Scene, Solid
 from mpmopt.scene.particles import discretise
@@ -208,3 +214,55 @@ def test_the_slope_of_the_projection_keeps_its_digits_where_it_saturates(beta):
     phi = np.array([-1.0, 0.7, 1.0])
     exact = [beta / (2.0 * math.tanh(beta) * math.cosh(beta * p) ** 2) for p in phi]
     assert project_adjoint(phi, beta, np.ones(3)) == pytest.approx(exact, rel=1e-13)
+
+
+def field_of(scene, function):
+    """A function of position on the design particles, in units of their spacing from a corner."""
+    particles = discretise(scene)
+    place = particles.position[particles.designed]
+    spacing = scene.grid.dx / scene.particles_per_cell
+    return particles, function(*((place - place.min(axis=0)) / spacing).T)
+
+
+def test_differences_are_exact_for_a_quadratic_field_inside():
+    particles, field = field_of(small_scene(), lambda x, y: 2.0 * x - y + 0.5 * x**2 + 3.0 * x * y)
+    x, y = field_of(small_scene(), lambda x, y: np.array([x, y]))[1]
+    inside = (x > 1) & (x < x.max() - 1) & (y > 1) & (y < y.max() - 1)
+    dx, dy, xx, yy, xy = (
+        (matrix @ field)[inside] for matrix in lattice_differences(small_scene(), particles)
+    )
+    assert dx == pytest.approx((2.0 + x + 3.0 * y)[inside])
+    assert dy == pytest.approx((-1.0 + 3.0 * x)[inside])
+    assert xx == pytest.approx(REACH * 1.0) and yy == pytest.approx(0.0, abs=1e-12)
+    assert xy == pytest.approx(math.sqrt(2.0) * REACH * 3.0)
+
+
+@pytest.mark.parametrize("slope", [1e-3, 0.1, 1.0])
+def test_a_subpixel_edge_is_as_wide_as_a_particle_however_slowly_the_design_varies(slope):
+    particles, field = field_of(small_scene(), lambda x, y: slope * (x - 4.25))
+    differences = lattice_differences(small_scene(), particles)
+    gamma = project_subpixel(field, 100.0, 0.5, differences)
+    x = field / slope
+    assert np.all(gamma[x < -REACH] < 0.5 * math.exp(-100.0 * slope) + 1e-12)
+    grey = (gamma > 0.01) & (gamma < 0.99)
+    assert np.all(abs(x[grey]) < max(REACH, 0.03 / slope))
+    if slope >= 0.1:  # a quarter of a spacing inside, where the curve and no tanh says how much
+        assert gamma[np.isclose(x, 0.25)] == pytest.approx(0.885, abs=0.05)
+
+
+def test_a_design_that_does_not_vary_is_projected_as_ever():
+    particles, field = field_of(small_scene(), lambda x, y: np.full(x.shape, 0.3))
+    gamma = project_subpixel(field, 4.0, 0.4, lattice_differences(small_scene(), particles))
+    assert gamma == pytest.approx(project(field, 4.0, 0.4), rel=1e-12)
+
+
+@pytest.mark.parametrize("beta", [2.0, 100.0])
+@pytest.mark.parametrize("threshold", [0.4, 0.5])
+def test_the_adjoint_of_the_subpixel_projection_is_its_complex_step(beta, threshold):
+    rng = np.random.default_rng(3)
+    particles, field = field_of(small_scene(), lambda x, y: rng.uniform(-0.9, 0.9, x.shape))
+    differences = lattice_differences(small_scene(), particles)
+    direction, bar = rng.standard_normal((2, field.size))
+    moved = project_subpixel(field + 1e-30j * direction, beta, threshold, differences)
+    phi_bar = project_subpixel_adjoint(field, beta, bar, threshold, differences)
+    assert direction @ phi_bar == pytest.approx(bar @ moved.imag / 1e-30, rel=1e-12)

@@ -64,7 +64,22 @@ def test_the_help_lists_every_command_and_its_examples_are_understood():
     shown = re.findall(r"^  mpmopt ([a-z]+ \S+)", help_text, re.MULTILINE)
     assert len(shown) >= 3
     for example in shown:
-        PARSER.parse_args(example.split())
+        name, option = example.split()
+        if name not in commands.ROBOTS:
+            PARSER.parse_args([name, option])
+    assert f"  {', '.join(commands.ROBOTS)}\n" in help_text
+
+
+@pytest.mark.process
+@pytest.mark.parametrize("name", commands.ROBOTS)
+def test_a_robot_is_asked_for_in_a_clone_as_its_script_is(name):
+    done = command(name, "--help")
+    script = subprocess.run(
+        [sys.executable, f"cases/{name}.py", "--help"], capture_output=True, text=True, cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "200"},
+    )  # fmt: skip
+    assert (done.returncode, script.returncode) == (0, 0), done.stderr + script.stderr
+    assert done.stdout.split()[3:] == script.stdout.split()[2:]
 
 
 def test_the_installed_command_is_this_one():

@@ -27,7 +27,7 @@ from mpmopt.errors import DesignError, SceneError
 from mpmopt.optimisation.loop import optimise
 from mpmopt.optimisation.settings import Settings, Stage
 from mpmopt.results.runfile import write
-from mpmopt.scene import Actuator, Mirror, Wall
+from mpmopt.scene import Actuator, Ground, Mirror, Wall
 
 
 def smooth(problem):
@@ -156,6 +156,49 @@ def test_the_loosest_tolerance_takes_the_cheapest_and_the_tightest_the_reference
     tight = mpmopt.cheapest(scene, x, 1e-12, beta=2.0)
     assert replace(tight.best, precision="double") == tight.reference.discretisation
     assert tight.gradient_uncertainty > 1e-12
+
+
+def on_ground(**changes):
+    """The small walker on a layer, which both formulations know."""
+    ground = (Ground.floor(3 / 16, friction=0.3, thickness=1 / 16),)
+    return small_scene(walls=(), ground=ground, steps=8, time_step=2e-3, **changes)
+
+
+def test_both_formulations_are_measured_each_against_its_own_finest():
+    found = cheapest(on_ground(), smooth, 1e-9, gradient_tolerance=math.inf)
+    assert found.reference.discretisation.formulation == "updated"  # the scene's own
+    assert found.other_reference is not None
+    assert found.other_reference.discretisation.formulation == "total"
+    finest = {"updated": found.reference, "total": found.other_reference}
+    for row in found.rows:
+        errors = row.measured.errors(finest[row.measured.discretisation.formulation])
+        assert row.objective_error == errors[0]
+    apart = found.other_reference.errors(found.reference)
+    assert (found.objective_apart, found.gradient_apart) == apart[:2]
+    assert 1e-9 < found.objective_apart < 0.5
+    assert f"differ in travel by {found.objective_apart:.3g}" in found.doubt
+    loose = replace(found, tolerance=0.5, objective_uncertainty=0.1)
+    assert loose.doubt == ""
+    walled = cheapest(small_scene(steps=8), smooth, 1e9)
+    assert walled.other_reference is None
+    assert math.isnan(walled.objective_apart)
+    assert {row.measured.discretisation.formulation for row in walled.rows} == {"updated"}
+
+
+@pytest.mark.parametrize("faster", ["updated", "total"])
+def test_the_formulation_that_takes_less_time_is_the_cheapest(monkeypatch, faster):
+    def clocked(scene, discretisation, *arguments, real=measure, **options):
+        measured = real(scene, discretisation, *arguments, **options)
+        work = math.prod(discretisation.cells) * discretisation.steps
+        share = 1.0 if discretisation.formulation == faster else 100.0
+        return replace(measured, seconds=share * work / 1e4)
+
+    monkeypatch.setattr("mpmopt.assess.discretisation.measure", clocked)
+    found = cheapest(on_ground(), smooth, 1e9)
+    assert found.best.formulation == faster
+    assert found.reference.discretisation.formulation == faster
+    # The total Lagrangian formulation has no single precision: none is tried.
+    assert not any("precision" in row.measured.failure for row in found.rows)
 
 
 def test_what_makes_no_sense_is_refused():

@@ -8,8 +8,8 @@ from conftest import worst
 
 from mpmopt.assess.threshold import distance, kept
 from mpmopt.assess.verify import complex_step_test
-from mpmopt.design.chain import project, project_adjoint
 from mpmopt.design.problem import Problem
+from mpmopt.design.projection import project, project_adjoint
 from mpmopt.design.task import AtMost, Task
 from mpmopt.design.terms import Displacement, Effort, OnePiece, Volume
 from mpmopt.design.variation import Variation
@@ -76,6 +76,12 @@ def test_the_projection_goes_from_zero_to_one_and_its_adjoint_is_exact(threshold
 def test_gradients_of_an_ensemble_are_exact(sharpness, x):
     task = dataclasses.replace(TASK, soft_minimum=sharpness)
     assert worst(complex_step_test(Problem(SCENE, 2.0, task=task), x)) <= 1e-12
+
+
+def test_the_gradient_of_a_subpixel_design_is_exact_in_all_scenes(x):
+    task = dataclasses.replace(TASK, scenes=(*SCENES, Variation(refinement=2)))
+    problem = Problem(SCENE, 50.0, task=task, subpixel=True)
+    assert worst(complex_step_test(problem, x)) <= 1e-12
 
 
 def test_finer_cells_take_their_design_from_the_others(x):

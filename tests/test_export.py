@@ -581,7 +581,7 @@ def run_file(path, problem, x):
         ("move_limit", "non_discreteness", "projected_gradient", "step"), 0.1
     )
     item = Candidate(
-        stage=0, beta=stage.beta, time_step=stage.time_step, objective=0.5,
+        stage=0, beta=stage.beta, time_step=problem.scene.time_step, objective=0.5,
         seconds=1.0, x=x, gamma=problem.gamma(x), **numbers,
     )  # fmt: skip
     run.best[0] = run.first = run.last = item

@@ -53,7 +53,7 @@ def test_what_the_page_says_is_where_it_says():
     said = re.findall(r"``([\w/]+\.py)``((?:: ``\w+``(?:, ``\w+``)*)?)", PAGE)
     assert len(said) > 25
     for file, names in said:
-        path = ROOT / file if file.startswith("tests/") else PACKAGE / file
+        path = ROOT / file if file.startswith(("tests/", "cases/")) else PACKAGE / file
         assert path.is_file(), file
         assert set(re.findall(r"``(\w+)``", names)) <= names_in(path), file
 

@@ -30,7 +30,7 @@ def blocks(page: str) -> list[str]:
     return [textwrap.dedent(block) for block in found]
 
 
-def few(time_step: float, most_iterations: int) -> Settings:
+def few(time_step: float | None = None, most_iterations: int = 4) -> Settings:
     """One stage of few evaluations, instead of a preset's."""
     return Settings((Stage(2.0, 1e-2, 1e-3, time_step, move_limit=0.1),), most_iterations=4)
 

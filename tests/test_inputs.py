@@ -2,13 +2,15 @@
 
 import dataclasses
 import doctest
+import json
+from inspect import signature
 from typing import Any
 
 import numpy as np
 import pytest
 from conftest import SHORT, small_scene
 
-from mpmopt.app.case import Case, ProgressBar, baseline_particles, resume, run
+from mpmopt.app.case import Case, baseline_particles, resume, run
 from mpmopt.app.multistart import multistart
 from mpmopt.app.summary import summarise
 from mpmopt.assess.refinement import study
@@ -17,13 +19,17 @@ from mpmopt.design.problem import Problem
 from mpmopt.errors import DesignError, SceneError, SweepError
 from mpmopt.optimisation.loop import begin, check_body_fits, go_on, optimise
 from mpmopt.optimisation.presets import continuation
-from mpmopt.optimisation.settings import Settings, Stage
+from mpmopt.optimisation.settings import STAGES, Settings, Stage
 from mpmopt.results import runfile
-from mpmopt.scene import Actuator, Design, Mirror, Scene, Solid
+from mpmopt.scene import Actuator, Design, Ground, Mirror, Scene, Solid
 from mpmopt.simulation.checkpoints import Checkpointing
+from mpmopt.view.live import ProgressBar
 
 C = 1 / 16
 SCENE = small_scene(steps=4)
+ON_GROUND = small_scene(
+    walls=(), ground=(Ground.floor(3.5 * C, thickness=C),), steps=8, time_step=2e-3
+)
 PROBLEM = Problem(SCENE)
 START = PROBLEM.join(0.0, 1.0, -0.3, -0.5)
 STAGE = SHORT.stages[0]
@@ -38,6 +44,55 @@ def test_one_stage_one_list_of_numbers_and_one_callback_are_enough():
         optimise(SCENE, settings, start, calls.append)
         assert np.array_equal(calls[-1].first.x, START)
     assert len(calls) == 2 * (2 + 1)
+
+
+@pytest.mark.parametrize(
+    ("formulation", "floors"), [("updated", (1e-2, 1e-3)), ("total", (2e-3, 2e-4))]
+)
+def test_a_stage_names_what_differs_from_the_scene_and_its_formulation(formulation, floors):
+    scene = dataclasses.replace(ON_GROUND, formulation=formulation)
+    posed = Stage(2.0).scene(scene)
+    assert (posed.time_step, posed.steps) == (scene.time_step, scene.steps)
+    assert (posed.material.void_density, posed.material.void_stiffness) == floors
+    assert posed == Stage(2.0, floors[0], floors[1], scene.time_step).scene(scene)
+    other = Stage(2.0, void_stiffness=5e-4, time_step=1e-3).scene(scene)
+    assert (other.time_step, other.material.void_density) == (1e-3, floors[0])
+    assert other.material.void_stiffness == 5e-4
+
+
+def test_a_scene_alone_can_be_optimised():
+    run = optimise(SCENE, Settings(most_iterations=1))
+    assert [item.beta for item in run.history] == [stage.beta for stage in STAGES]
+    assert run.first is not None and np.array_equal(run.first.x, START)
+    assert np.isfinite(run.result.counted)
+    assert signature(optimise).parameters["settings"].default == Settings()
+
+
+def test_another_formulation_has_floors_of_its_own_unless_they_are_named():
+    settings = Settings((Stage(1.0), Stage(1.0, 2e-3, 2e-4)))
+    case = Case(dataclasses.replace(ON_GROUND, formulation="total"), settings, solid_reference)
+    assert case.in_formulation("total").settings == settings
+    other = case.in_formulation("updated")
+    bare, named = other.settings.stages
+    assert bare.scene(other.scene) == named.scene(other.scene) == Stage(1.0).scene(ON_GROUND)
+
+
+def test_settings_of_a_run_file_are_read_whether_stages_name_all_or_little():
+    stage = {
+        "beta": 2.0, "void_density": 1e-2, "void_stiffness": 1e-3, "time_step": 4e-3,
+        "solid": False, "refined": False, "move_limit": 0.05, "void_cutoff": 0.0,
+        "most_iterations": None, "halvings": 2, "limited": True,
+    }  # fmt: skip
+    written = {
+        "adapt_move_limit": True, "sharpen_asymptotes": True, "best_first": True, "window": 10,
+        "tolerance": 2e-4, "least_iterations": None, "most_iterations": 200, "most_failures": 8,
+    }  # fmt: skip
+    settings = Settings(Stage(2.0, 1e-2, 1e-3, 4e-3))
+    text = json.dumps({"stages": [stage], **written})
+    assert Settings.from_dict(json.loads(text)) == settings
+    for each in (settings, Settings()):
+        text = json.dumps(dataclasses.asdict(each))
+        assert Settings.from_dict(json.loads(text)) == each
 
 
 def test_few_iterations_need_no_word_about_the_least():

@@ -19,6 +19,7 @@ from mpmopt.scene import Actuator, Design, Grid, Material, Mirror, Scene, Solid,
 from mpmopt.scene.ground import Ground
 from mpmopt.scene.particles import discretise
 from mpmopt.simulation.checkpoints import Checkpointing
+from mpmopt.simulation.indicators import looked_at
 from mpmopt.simulation.lagrangian import LagrangianSimulation
 from mpmopt.simulation.simulation import Simulation
 
@@ -397,3 +398,51 @@ def test_states_one_after_the_other_are_those_of_a_run():
     simulation = free_block(steps=3)
     one_by_one = np.array(list(simulation.states()))
     assert np.array_equal(one_by_one, simulation.run(range(4)))
+
+
+def test_a_look_sees_what_the_definitions_say(rng):
+    material = Material(viscosity=0.1, void_density=1e-2, void_stiffness=1e-3)
+    scene = lattice_scene(material=material)
+    particles = discretise(scene)
+    count = len(particles.position)
+    density, stiffness = rng.uniform(0.3, 1.0, (2, count))
+    simulation = LagrangianSimulation(scene, particles, density, stiffness, np.zeros((60, 2)))
+    states = np.zeros((4, *simulation.start.shape))
+    for n, (shrunk, rough) in enumerate(((1.0, 0.3), (1.0, 2.0), (1.0, 0.0), (0.3, 0.1))):
+        states[n] = simulation.start
+        states[n, :2] += (shrunk - 1.0) * (states[n, :2] - 5 * C)
+        states[n, :2] += shrunk * rough * C * rng.standard_normal((2, simulation.nodes))
+    solid = stiffness >= 0.5
+    per_dx = scene.time_step / scene.grid.dx
+    expected = []
+    for nodes in states:
+        state = simulation.particle_state(nodes)
+        F = kernels.parts(state).deformation[..., solid]
+        J = F[0, 0] * F[1, 1] - F[0, 1] * F[1, 0]
+        s2 = np.linalg.svd(F.T)[1][:, 0] ** 2
+        log, slope, bend = kernels.plain(lagrangian.continued)(J)
+        hardening = material.lame_lambda * slope**2
+        hardening += (material.lame_lambda * log - material.lame_mu) * bend
+        share = (stiffness / density)[solid]
+        elastic = per_dx**2 * share * (material.lame_mu + np.maximum(hardening, 0.0) * s2)
+        viscous = per_dx / scene.grid.dx * share * material.viscosity * s2
+        courant = (viscous + np.sqrt(viscous**2 + elastic)).max()
+        expected.append((courant, J.min(), *simulation.gap(kernels.grouped(state))))
+        found = simulation.look(nodes[None], [0])
+        assert (found.courant, found.jacobian) == pytest.approx((courant, J.min()), rel=1e-13)
+        assert found[5:] == pytest.approx(expected[-1][2:], rel=1e-13)
+    seen = simulation.look(states, [3, 1])
+    assert seen.courant == pytest.approx(max(expected[3][0], expected[1][0]), rel=1e-13)
+    assert seen.jacobian == pytest.approx(min(expected[3][1], expected[1][1]), rel=1e-13)
+    assert seen[5:] == pytest.approx(min(expected[3][2:], expected[1][2:]), rel=1e-13)
+    assert min(each[1] for each in expected) < lagrangian.LEAST_J
+    assert seen.gap < math.inf
+
+
+@pytest.mark.parametrize("segment", [1, 7, 64, 100, 1000])
+def test_states_are_looked_at_once_whatever_the_segments(segment):
+    steps, seen = 200, []
+    for first in range(0, steps, segment):
+        last = min(first + segment, steps)
+        seen += [first + slot for slot in looked_at(first, last, steps, 64)]
+    assert seen == [0, 64, 128, 192, 200]

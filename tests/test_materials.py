@@ -161,18 +161,20 @@ def test_scenes_of_several_materials_go_to_json_and_back():
 
 
 def test_a_silicone_robot_moves_in_metres_and_seconds():
-    # Half a second on cells of 2 mm: it stands in the layer, 6 to 8 mm, and goes some millimetres.
-    scene = silicone_walker()
+    # As drawn: it stands in the layer, 4.5 to 6 mm high, or hops, and goes some millimetres.
+    scene = dataclasses.replace(silicone_walker(), steps=2000, transient=0.0)
     assert 0.5 < scene.time_step / scene.largest_time_step < 1.0
+    assert max(scene.extent) == pytest.approx(0.06)
     particles = discretise(scene)
     keep = slanted_legs(particles.position[particles.designed])
-    body = solid_body(scene, keep, Variables(np.zeros(0), *np.array([[1.0], [-0.3], [-0.5]])))
+    actuation = np.array([[1.0], [-0.3], [-0.5], [0.0]])
+    body = solid_body(scene, keep, Variables(np.zeros(0), *actuation))
     mass = float(body.data.mass.sum())  # kg per metre of depth
-    assert 0.6 < mass < 0.9
+    assert 0.8 < mass < 1.1
     run = body.watch()
     assert run.indicators.courant < 1.0
-    assert run.indicators.stretch < 2.0
+    assert run.indicators.jacobian > 0.9
     end = run.states[scene.steps]
-    assert 6e-3 < end[1].min() < 8e-3
+    assert 4.5e-3 < end[1].min() < 12e-3
     gone = (end[0] - body.initial[0])[~body.particles.designed].mean()
-    assert 1e-3 < abs(gone) < 2e-2
+    assert 2e-3 < gone < 2e-2

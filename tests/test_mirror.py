@@ -143,3 +143,18 @@ def test_only_the_half_is_laid_out():
     half, whole = discretise(scene), discretise(scene, whole=True)
     assert half.position[:, 1].max() < 0.5
     assert 2 * half.volume.sum() == pytest.approx(whole.volume.sum())
+
+
+@pytest.mark.parametrize("axis", ["x", "y"])
+def test_the_subpixel_projection_of_half_a_body_is_that_of_the_whole(axis):
+    half = channel(axis)
+    whole = dataclasses.replace(half, mirror=None)
+    problems = [Problem(scene, 100.0, subpixel=True) for scene in (half, whole)]
+    parts = [p.particles.subset(p.particles.designed) for p in problems]
+    image = mirror_images(half, *parts)
+    phi = np.where(parts[0].position.sum(axis=1) < 12 * C, 1.0, -1.0)
+    gamma, gamma_whole = (
+        p.gamma(p.join(f, 1.0, 0.0, 0.0)) for p, f in zip(problems, (phi, phi[image]))
+    )
+    assert np.ptp(gamma) > 0.5
+    assert gamma[image] == pytest.approx(gamma_whole, abs=1e-12)

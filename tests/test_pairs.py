@@ -120,6 +120,28 @@ def test_the_force_is_that_of_all_pairs(rng, corners, changes, per_cell):
     assert seen >= 2
 
 
+def test_what_moves_alike_keeps_its_lists_but_not_those_of_images(rng):
+    whole = simulation_of(body(*FORK))
+    touch, nodes = whole.lattice.touch, whole.start.copy()
+    near, _ = pairs.renewed(pairs.nowhere(touch), nodes, touch)
+    nodes[:2] += 9.0 * C * rng.uniform(-1.0, 1.0, (2, 1))
+    kept, room = pairs.renewed(near, nodes, touch)
+    assert np.array_equal(kept.cells_at, whole.start[:2])
+    assert room == pytest.approx(pairs.HALF * pairs.WIDE_SKIN * C, rel=1e-9)
+    for axis, corners in (("x", IMAGES), ("y", RAILS)):
+        half = simulation_of(body(*corners, mirror=Mirror(axis, 8 * C)))
+        touch, nodes = half.lattice.touch, half.start.copy()
+        near, seen = pairs.nowhere(touch), 0
+        for _ in range(8):
+            nodes[half.scene.mirror.normal] += 0.45 * C
+            near, _ = pairs.renewed(near, nodes, touch)
+            force, expected = np.zeros_like(nodes), by_hand(half, nodes)
+            pairs.push_apart(near, nodes, touch, force)
+            assert force[:2] == pytest.approx(expected, rel=1e-12, abs=1e-12)
+            seen += np.abs(expected).max() > 0.0
+        assert 2 <= seen < 8
+
+
 def collided(simulation, speed):
     closing(simulation, speed)
     steps = simulation.steps
@@ -144,7 +166,7 @@ def test_blocks_that_collide_keep_their_momenta_and_bounce():
     speeds = [simulation.particle_state(each)[2, left].mean() for each in states]
     assert speeds[0] > 1.0
     assert speeds[-1] < 0.0
-    gaps = [simulation.look(each).gap for each in states[::8]]
+    gaps = [simulation.look(states, [n]).gap for n in range(0, 81, 8)]
     assert 0.3 < min(gaps) < 1.5
 
 
@@ -227,7 +249,7 @@ def test_half_a_body_pushes_its_image_as_the_whole_one_does(corners):
     own, position = half.particles.position, whole.particles.position[left]
     order = [np.abs(own - each).sum(axis=1).argmin() for each in position]
     assert half.run()[:, order] == pytest.approx(expected, rel=1e-9, abs=1e-10)
-    assert half.look(half.start).gap == math.inf
+    assert half.look(half.start[None], [0]).gap == math.inf
 
 
 def test_a_block_rests_on_another_at_the_gap_that_bears_it():

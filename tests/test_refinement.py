@@ -10,11 +10,12 @@ from crawler import crawler
 from walker import slanted_legs, walker
 
 from mpmopt.__main__ import main
-from mpmopt.assess.refinement import study
+from mpmopt.assess import refinement
+from mpmopt.assess.refinement import study, variants, with_twice_the_step
 from mpmopt.assess.threshold import distance, retained_share
 from mpmopt.design.problem import Problem
 from mpmopt.design.variation import refined
-from mpmopt.errors import SceneError
+from mpmopt.errors import SceneError, SimulationError
 from mpmopt.optimisation.loop import optimise
 from mpmopt.results import runfile
 from mpmopt.scene import Actuator, Ground
@@ -65,16 +66,32 @@ def test_the_finer_robot_has_the_same_shape():
         assert areas[0] == pytest.approx(areas[1])
 
 
-def test_what_cannot_be_simulated_says_why():
+def test_a_step_over_the_stability_limit_is_left_out():
     scene = small_scene()
-    scene = scene.vary(
-        time_step=scene.duration / np.ceil(scene.duration / (0.9 * scene.largest_time_step))
-    )
-    problem = Problem(scene)
+    for share in (0.45, 0.9):
+        step = scene.duration / np.ceil(scene.duration / (share * scene.largest_time_step))
+        there = scene.vary(time_step=step)
+        longer = with_twice_the_step(there)
+        assert (longer is None) == ("twice the step" not in variants(there)) == (share > 0.5)
+        if longer is not None:
+            assert longer.time_step == 2.0 * step
+            assert longer.steps == there.steps // 2
+
+
+def test_what_cannot_be_simulated_says_why(monkeypatch):
+    problem = Problem(small_scene())
+    real = refinement.distance
+
+    def fails(scene, *rest):
+        if scene.time_step < problem.scene.time_step:
+            raise SimulationError("made to fail", 3, 1, (0.0, 0.0), "none")
+        return real(scene, *rest)
+
+    monkeypatch.setattr(refinement, "distance", fails)
     rows = {row.name: row for row in study(problem, problem.join(0.5, 0.1, 0.2, 0.1))}
-    assert "time_step" in rows["twice the step"].failure
-    assert np.isnan(rows["twice the step"].retained)
-    assert not rows["half the step"].failure
+    assert "made to fail" in rows["half the step"].failure
+    assert np.isnan(rows["half the step"].retained)
+    assert not rows["as designed"].failure
 
 
 def test_a_body_without_design_is_audited_too():

@@ -95,6 +95,13 @@ def test_a_killed_run_ends_as_it_would_have(whole, tmp_path):
 
 
 @pytest.mark.process
+def test_a_run_in_three_scenes_ends_as_it_would_have_for_any_threads_and_kills(tmp_path):
+    rows = faults.ensembles(tmp_path, 2, random.Random(3))
+    assert sum(row.done for row in rows) == 2 + 2
+    assert all(row.survived == row.done for row in rows), rows
+
+
+@pytest.mark.process
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_signal_ends_a_run_with_its_code_and_says_how_to_go_on(whole, tmp_path, number, code):
     process = faults.Process(tmp_path / "out")
@@ -134,11 +141,19 @@ def test_a_second_signal_ends_the_process_at_once(second):
     assert process.returncode == -second
 
 
-def test_a_signal_that_a_library_swallows_is_not_lost(capfd):
-    @ctypes.CFUNCTYPE(None)
-    def callback():  # as a compiler has them
-        os.kill(os.getpid(), signal.SIGTERM)
+@ctypes.CFUNCTYPE(None)
+def callback():  # as a compiler has them
+    os.kill(os.getpid(), signal.SIGTERM)
 
+
+def test_a_signal_that_a_library_swallows_comes_again(capfd):
+    with pytest.raises(Interrupted, match="SIGTERM"), interruptible():
+        callback()
+        time.sleep(20)
+    assert capfd.readouterr().err == ""
+
+
+def test_a_signal_that_a_library_swallows_is_not_lost(capfd):
     with pytest.raises(Interrupted, match="SIGTERM"), interruptible():
         callback()
         raise RuntimeError("no compiled object yet")

@@ -21,9 +21,9 @@ from mpmopt.assess.robustness import (
     components,
     follow,
     lasting,
-    refined,
     speed,
     whole_periods,
+    with_cells,
     with_frequency,
 )
 from mpmopt.assess.threshold import kept
@@ -106,6 +106,9 @@ def test_a_speed_is_the_way_over_the_time_in_whole_periods(formulation, soon):
     assert pushed == pytest.approx(g * (0.024 + later) / 2 - back, rel=0.02)
     with pytest.raises(SceneError, match="particles times steps"):
         speed(robot, Trial(lambda: scene), most_work=100.0)
+    quick = dataclasses.replace(scene, steps=1500, transient=2.0)
+    end = whole_periods(robot.period(quick), 0.04, 0.32)
+    assert speed(robot, Trial(lambda: quick)) == pytest.approx(g * (0.04 + end) / 2, rel=0.02)
 
 
 def test_an_actuation_that_is_held_is_the_same_till_then(soon, monkeypatch):
@@ -129,14 +132,14 @@ def test_scenes_are_what_their_names_say():
     longer = lasting(scene, 1.0)
     assert longer.duration == pytest.approx(1.0)
     assert longer.grid.cells == (16 + 48, 16)
-    fine = refined(scene, 2.0, "total")
+    fine = with_cells(scene, 2.0, "total")
     assert (fine.grid.cells, fine.formulation) == ((32, 32), "total")
     assert fine.time_step == pytest.approx(2e-3)
-    assert refined(on_ground("total"), 1.0).formulation == "total"
+    assert with_cells(on_ground("total"), 1.0).formulation == "total"
     viscous = dataclasses.replace(
         scene, material=dataclasses.replace(scene.material, viscosity=0.1)
     )
-    assert refined(viscous, 4.0).time_step == 5e-4  # a quarter would be too long there
+    assert with_cells(viscous, 4.0).time_step == 5e-4  # a quarter would be too long there
     assert [ground.friction for ground in Variation(friction=0.7).scene(scene).ground] == [0.7]
     strong = with_frequency(Variation(strength=1.2).scene(scene), 0.8).actuators
     assert strong[0].stress == ((2.4, 0.6), (0.6, 1.2))
@@ -150,7 +153,7 @@ def test_scenes_are_what_their_names_say():
     slower = Robot.of(problem, problem.join(1.0, 0.5, 0.0, 0.0, (-1.0, 0.0)))
     assert slower.period(problem.scene) == pytest.approx(2 * np.pi / 15.0)
     with pytest.raises(SceneError, match="no whole number"):
-        refined(on_ground(grid=Grid((17, 16), C)), 0.5)
+        with_cells(on_ground(grid=Grid((17, 16), C)), 0.5)
     assert not can_be_studied(small_scene())
 
 
@@ -185,7 +188,7 @@ def test_a_robot_is_in_one_piece_and_the_same_on_other_cells():
     robot = Robot.of(problem, design)
     assert 0 < robot.keep.sum() < there.sum()
     assert components(scene, robot.keep) == 1
-    assert robot.in_scene(refined(scene, 2.0)).sum() == 4 * robot.keep.sum()
+    assert robot.in_scene(with_cells(scene, 2.0)).sum() == 4 * robot.keep.sum()
 
 
 def test_components_are_those_of_the_whole_body_over_edges():

@@ -100,12 +100,13 @@ def run():
 
 def test_every_field_of_a_run_comes_back_from_its_file(run, tmp_path):
     baseline = np.array([True, False, True])
-    runfile.write(tmp_path / "run.h5", run, {"start": 0.25, "a": [1.0, None]}, baseline)
+    runfile.write(tmp_path / "run.h5", run, {"start": 0.25, "a": [1.0, None]}, baseline, True)
     back = runfile.read_run(tmp_path / "run.h5")
     for field in dataclasses.fields(Optimisation):
         assert same(getattr(back.run, field.name), getattr(run, field.name)), field.name
     assert same(back.summary, {"start": 0.25, "a": [1.0, None]})
     assert same(back.baseline, baseline)
+    assert back.full_study
 
 
 def test_every_number_of_an_evaluation_is_a_column_of_the_history(run, tmp_path):

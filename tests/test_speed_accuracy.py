@@ -8,11 +8,24 @@ import numpy as np
 import pytest
 import speed_accuracy
 from exact import Bar
-from speed_accuracy import BETA, PLAIN, ROBOTS, Point, design, front, settings
+from speed_accuracy import (
+    BETA,
+    PLAIN,
+    ROBOTS,
+    TOTAL,
+    Point,
+    at_equal_accuracy,
+    design,
+    front,
+    robots,
+    settings,
+)
 
 from mpmopt.assess.discretisation import Discretisation, Measured
 from mpmopt.design.problem import Problem
 from mpmopt.errors import SceneError
+
+BARS = (("bar", "updated"), ("bar", "total"))
 
 
 def bar_errors(n, courant, **options):
@@ -45,18 +58,45 @@ def test_at_small_steps_the_bar_is_right_to_the_order_of_the_cells():
     assert np.all(fine <= 1e-3)
 
 
+def test_the_total_lagrangian_bar_converges_with_order_two_at_a_fixed_courant_number():
+    errors = np.array([bar_errors(n, 0.4, formulation="total") for n in (8, 16, 32)])
+    assert np.all(np.log2(errors[:-1] / errors[1:]) >= 1.8)
+    assert np.all(errors[-1] <= 3e-3)
+    with pytest.raises(SceneError, match="stability limit"):
+        Bar(16, 0.8, formulation="total")
+
+
 @pytest.mark.parametrize("name", list(ROBOTS))
 def test_every_resolution_sees_the_same_robot(name):
     scene, phi = ROBOTS[name]
     mass = []
     for n in (64, 128, 256):
-        problem = Problem(Discretisation.of(scene, n / 128, 0.4).scene(scene), BETA)
+        problem = Problem(Discretisation.of(scene, n / 128, 0.2).scene(scene), BETA)
         gamma = problem.gamma(design(phi)(problem))
         volume = problem.particles.volume[problem.particles.designed]
         mass.append(gamma @ volume / volume.sum())
     assert 0.2 < mass[-1] < 0.8
     # The filter is as wide as the cells are, so it blurs less on finer grids.
     assert max(mass) / min(mass) <= 1.03
+
+
+def test_the_time_at_equal_accuracy_is_of_points_that_are_not_right_by_chance():
+    def point(n, seconds, error, choice=PLAIN, scene="bar"):
+        here = Discretisation((n, n), 1, formulation=choice.formulation)
+        measured = Measured(here, seconds, travel=1.0)
+        return Point(scene, n, 1, 0.4, choice.name, measured, travel_error=error)
+
+    points = [
+        point(32, 1.0, 0.009), point(64, 4.0, 0.1), point(128, 16.0, 0.01),
+        point(32, 0.5, 0.2, TOTAL), point(64, 2.0, 0.01, TOTAL), point(128, 8.0, 0.002, TOTAL),
+    ]  # fmt: skip
+    rows = {row["off by at most"]: row for row in at_equal_accuracy(points, {"bar": 0.03})}
+    assert rows["20 %"]["times"] == "2.0"  # 1 s and 0.5 s
+    assert rows["5 %"]["times"] == "8.0"  # 16 s and 2 s: 32 cells are right by chance
+    assert rows["0.5 %"]["updated"] == "none"
+    assert rows["0.5 %"]["total, s"] == "8"
+    assert "0.1 %" not in rows
+    assert rows["1 %"]["references apart"] == "3.0%"
 
 
 def test_the_front_is_a_front():
@@ -88,14 +128,13 @@ def test_all_points_can_be_laid_out_and_are_measured_once(quick):
     assert len(set(points)) == len(points)
     for name, (scene, _) in ROBOTS.items():
         for n, courant, choice in points:
-            if not speed_accuracy.is_possible(name, n, courant):
-                with pytest.raises(SceneError, match="stability limit"):
-                    Discretisation.of(scene, n / 128, courant).scene(scene)
+            here = speed_accuracy.laid_out(scene, n, courant, choice)
+            if not speed_accuracy.is_possible(name, n, courant, choice):
+                with pytest.raises(SceneError, match=r"stability limit|formulation"):
+                    here.scene(scene)
                 continue
-            here = Discretisation.of(
-                scene, n / 128, courant, particles_per_cell=choice.per_cell
-            ).scene(scene)
-            assert here.courant <= courant * (1.0 + 1e-9), name
+            assert here.scene(scene).courant <= courant * (1.0 + 1e-9), name
+            assert here.formulation == choice.formulation
     if not quick:
         assert speed_accuracy.PAPER in points
         assert speed_accuracy.RECOMMENDED in points
@@ -109,21 +148,25 @@ def test_a_chart_is_left_with_its_tables(tmp_path, monkeypatch, drawn):
     for name, (scene, phi) in ROBOTS.items():
         monkeypatch.setitem(ROBOTS, name, (speed_accuracy.lasting(scene, 0.02), phi))
     monkeypatch.setattr(Bar, "duration", 1.0)
-    points = [(32, 0.4, PLAIN), (32, 0.8, PLAIN), (64, 0.8, PLAIN)]
+    points = [(32, 0.4, PLAIN), (32, 0.8, PLAIN), (64, 0.8, PLAIN), (32, 0.4, TOTAL)]
     monkeypatch.setattr(speed_accuracy, "settings", lambda quick: points)
     monkeypatch.setattr(speed_accuracy, "QUICK_REFERENCE", (96, 0.8, PLAIN))
     assert speed_accuracy.main(["--quick", "--out", str(tmp_path)]) == 0
     assert ((tmp_path / "speed_accuracy.png").stat().st_size > 10_000) == drawn
     with (tmp_path / "speed_accuracy.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert [(row["scene"], row["n"]) for row in rows] == [
-        *((name, n) for name in ("bar", "walker", "crawler") for n in ("32", "32", "64")),
-        ("walker on a layer", "32"),
-    ]
+    assert [(row["scene"], row["n"], row["choice"]) for row in rows] == [
+        *(("bar", n, PLAIN.name) for n in ("32", "32", "64")),
+        ("bar", "32", TOTAL.name),
+        *((name, n, PLAIN.name) for name in ("walker", "crawler") for n in ("32", "32", "64")),
+        *((f"{name} on ground", "32", choice.name) for name in ("walker", "crawler")
+          for choice in (PLAIN, TOTAL)),
+    ]  # fmt: skip
     assert not any(row["failure"] for row in rows)
     with h5py.File(tmp_path / "speed_accuracy.h5") as file:
-        for name in ROBOTS:
-            group = file[name]
+        assert list(file) == sorted(f"{name}, {f}" for name, f in [*BARS, *robots()])
+        for name, formulation in robots():
+            group = file[f"{name}, {formulation}"]
             travel = group["travel"][:] / group.attrs["reference travel"]
             assert np.abs(travel - 1.0) == pytest.approx(group["travel_error"][:])
             apart = np.linalg.norm(group["gradient"][:] - group["reference gradient"][:], axis=1)

@@ -106,6 +106,14 @@ def test_a_heavy_mass_floor_cures_void_that_is_flung():
     assert heavy["largest_deviation"] <= 0.01 * weak.GAIN
 
 
+def test_void_as_fast_as_solid_fails_in_the_total_lagrangian_formulation_and_slower_does_not():
+    equal = weak.one_square("walker", 0.35, 1e-3, heavy=False, designs=1, formulation="total")
+    assert equal["failed"] == 1
+    assert "not a number" in equal["error"]
+    slow = weak.one_square("walker", 0.35, 1e-4, heavy=True, designs=1, formulation="total")
+    assert (slow["void_density"], slow["failed"]) == (1e-3, 0)
+
+
 def test_stiff_light_void_is_refused():
     row = weak.one_square("crawler", 0.35, 1e-1, heavy=True, designs=1)
     assert row["refused"]
@@ -206,6 +214,15 @@ def test_a_pulled_bar_tears_with_two_particles_per_cell_and_comes_back_with_thre
     assert torn.min() > 0.0
     assert whole.min() < -0.9
     assert torn_stretch > 2.0
+
+
+def test_a_pulled_bar_comes_back_in_the_total_lagrangian_formulation_until_its_step_is_too_long():
+    back, stretch, said = fracture.pulled_bar(1.5, 2, 0.2, "total")
+    assert said == ""
+    assert back.min() < -0.9
+    assert stretch > 2.5  # where MLS-MPM is torn
+    _, _, said = fracture.pulled_bar(2.0, 2, 0.3, "total")
+    assert "smaller time step" in said
 
 
 @pytest.mark.parametrize("speed", [0.37, 1.01])

@@ -70,10 +70,15 @@ def told(monkeypatch):
     monkeypatch.setattr(summary, "post_processed", lambda problem, x: 0.45)
     monkeypatch.setattr(summary, "unactuated", lambda problem, x: 0.05)
 
-    def tell(references, distances, of_block=0.3):
+    def tell(references, distances, of_block=0.3, failed=""):
         block[0] = of_block
         numbers = zip(NAMES, zip(references, distances))
-        rows[:] = [Variant(name, (16, 16), 4e-3, r, d, retained=0.9) for name, (r, d) in numbers]
+        rows[:] = [
+            Variant(name, (16, 16), 4e-3, failure="torn")
+            if name == failed
+            else Variant(name, (16, 16), 4e-3, r, d, retained=0.9)
+            for name, (r, d) in numbers
+        ]
         return asked
 
     return tell
@@ -102,16 +107,21 @@ def test_references_take_the_better_of_the_first_and_the_best_actuation(told):
 
 
 def test_a_summary_is_of_the_best_design_and_counts_all_evaluations(told):
-    told((0.1,) * 4, (0.5, 0.35, 0.6, 0.7))
+    told((0.1,) * 4, (0.6, 0.35, 0.5, 0.7))
     summary = summarise(finished())
     wanted = {
-        "start": 0.1, "optimised": 0.5, "post_processed": 0.45, "actuation_off": 0.05,
+        "start": 0.1, "optimised": 0.5, "post_processed": 0.6, "actuation_off": 0.05,
         "post_processed_half_step": 0.35, "non_discreteness": 0.25, "a": [0.75, 0.75],
         "theta": [-0.3, -0.3], "b": [-0.5, -0.5], "evaluations": 3, "failed_evaluations": 1,
         "halved_evaluations": 0, "seconds": 7.0, "stop_reason": "It ended.",
     }  # fmt: skip
     assert {name: summary[name] for name in wanted} == wanted
     assert summary["retained_gain"] == {name: 0.9 for name in NAMES[1:]}
+
+
+def test_a_body_without_void_is_simulated_again_only_where_its_reference_failed(told):
+    told((0.1,) * 4, (0.6, 0.35, 0.5, 0.7), failed=NAMES[0])
+    assert summarise(finished())["post_processed"] == 0.45
 
 
 def test_a_cost_of_transport_is_that_of_the_body_without_grey(told, monkeypatch):

@@ -58,3 +58,16 @@ def test_a_step_stops_what_slides_against_it():
     _, over = pushed(terrain.FLAT)
     _, against = pushed(terrain.step(2 / 64))
     assert against[0].mean() < over[0].mean() - 0.01
+
+
+def test_a_robot_is_judged_on_ground_that_its_design_has_not_seen():
+    for case in terrain.CASES.values():
+        judged, *seen = (
+            np.array(scene.ground[0].points)[:20, 1]
+            for scene in (case.scene, *(each.scene(case.scene) for each in case.task.scenes[::2]))
+        )
+        assert np.ptp(judged) > 1.5 * terrain.C
+        assert len(seen) == 2
+        for heights in seen:
+            assert heights.shape == judged.shape
+            assert np.abs(heights - judged).max() > terrain.C

@@ -9,7 +9,6 @@ from conftest import small_scene
 from exact import at_rest, solid_simulation
 
 from mpmopt import __main__ as commands
-from mpmopt.app.case import ProgressBar
 from mpmopt.app.multistart import random_start, report
 from mpmopt.app.summary import summarise, table
 from mpmopt.assess import threshold
@@ -19,6 +18,7 @@ from mpmopt.optimisation.settings import Settings, Stage
 from mpmopt.results import runfile
 from mpmopt.scene import Actuator, Grid, Ground, Material, Solid
 from mpmopt.scene.particles import discretise
+from mpmopt.view.live import ProgressBar
 
 # What is a length; the rest has no unit.
 LENGTHS = ("objective", "post_processed", "refined", "projected_gradient")

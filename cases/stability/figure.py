@@ -86,7 +86,8 @@ def weak(heavy: bool) -> Callable[[Axes, Tables], None]:
         rows = [
             row
             for row in tables["weak"]
-            if (
+            if row["formulation"] == "updated"
+            and (
                 row["void_density"] == HEAVY
                 if heavy
                 else row["void_density"] == row["void_stiffness"]
@@ -168,19 +169,22 @@ def fracture(axes: Axes, tables: Tables) -> None:
 
 def vortex(axes: Axes, tables: Tables) -> None:
     """Errors of the vortex over its greatest stretch."""
-    for (cells, courant), rows in groups(tables["vortex"], "cells", "courant").items():
+    for (formulation, cells, courant), rows in groups(
+        tables["vortex"], "formulation", "cells", "courant"
+    ).items():
+        total = formulation == "total"
         style: dict[str, Any] = {
             "ls": "-" if courant == 0.4 else ":",
-            "color": f"C{(24, 48, 96).index(cells)}",
+            "color": f"C{(24, 48, 96).index(cells) + 3 * total}",
         }
         axes.loglog(
-            column(rows, "stretch"), column(rows, "error"), marker=".", lw=1,
-            label=f"{cells} cells, Courant {courant:g}", **style,
+            column(rows, "stretch"), column(rows, "error"), marker="D" if total else ".", lw=1,
+            ms=3 if total else 6, label=f"{cells} cells, {courant:g}{', total' * total}", **style,
         )  # fmt: skip
         lost = [row["stretch"] for row in rows if row["failure"]]
         axes.plot(
             lost,
-            np.full(len(lost), 2.0 * (1.25 if courant == 0.4 else 1.0)),
+            np.full(len(lost), 2.0 * (1.25 if courant == 0.4 else 1.0) * (1.5 if total else 1.0)),
             "x",
             **style | {"ls": ""},
         )
@@ -192,8 +196,8 @@ def vortex(axes: Axes, tables: Tables) -> None:
     axes.set_xlim(1.15, 8.0)
     axes.set_xlabel("greatest stretch (A = 0.05 ... 1)")
     axes.set_ylabel("error / A")
-    axes.set_title("Vortex (x: failed)")
-    axes.legend(fontsize=6, loc="lower right")
+    axes.set_title("Vortex, by Courant number (x: failed)")
+    axes.legend(fontsize=5, ncols=2, loc="lower right")
 
 
 def incline(axes: Axes, tables: Tables) -> None:

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from mpmopt.design.chain import project, project_adjoint
+from mpmopt.design.projection import project, project_adjoint
 from mpmopt.optimisation.mma import MMAError, MovingAsymptotes
 from stability.common import Found, Line, Measured, Points
 

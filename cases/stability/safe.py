@@ -44,7 +44,7 @@ def at_random(case: str, beta: float, seed: int, cells: int = 64) -> dict[str, A
         waves = rng.normal(scale=60.0, size=(2, 30))
         field = np.cos(positions @ waves + rng.uniform(0.0, 2.0 * np.pi, 30)).sum(axis=1)
         phi = np.clip(0.3 + field / 4.0, -1.0, 1.0)
-        x = problem.join(phi, *actuation(seed)[1:])
+        x = problem.join(phi, *actuation(scene, seed)[1:])
         simulation = problem.simulation(x)
         try:
             states = simulation.run([*range(0, scene.steps, 20), scene.steps])

@@ -5,23 +5,26 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from crawler import crawler
-from walker import walker
+from crawler import crawler, crawler_on_ground
+from walker import walker, walker_on_ground
 
 from mpmopt.assess.threshold import distance
-from mpmopt.design.actuation import signal
+from mpmopt.design.actuation import sizes
 from mpmopt.design.chain import interpolate
 from mpmopt.design.objective import Objective
 from mpmopt.design.problem import Variables
 from mpmopt.errors import SceneError, SimulationError
 from mpmopt.scene import Grid, Material, Scene
 from mpmopt.scene.particles import discretise
-from mpmopt.simulation.simulation import Simulation
+from mpmopt.scene.scene import Formulation
+from mpmopt.simulation.formulations import simulation_of
 from stability.common import Array, Found, Line, Measured, Points
 from stability.time_step import block_scene, linear_limit
 
 EPSILONS = tuple(10.0**-k for k in range(1, 7))
 COURANTS = (0.14, 0.25, 0.35, 0.5, 0.6, 0.7, 0.8)
+TOTAL_COURANTS = (0.14, 0.35)
+VISCOSITY = 0.03  # of the cases in the total Lagrangian formulation
 HEAVY = 1e-2  # the void density that is the cure
 SAFE_STIFFNESS = 1e-3
 GAIN = 0.25  # of an optimised walker: deviations are judged by it
@@ -39,16 +42,35 @@ def roomy_walker(cells: int, time_step: float) -> Scene:
     return replace(scene, grid=Grid((2 * cells, cells), 1 / cells), body=body)
 
 
+def free_walker(cells: int, time_step: float) -> Scene:
+    """The walker in the total Lagrangian formulation, on ground with a layer."""
+    scene = walker_on_ground(cells, time_step, 2.0)
+    return replace(scene, steps=round(1.0 / time_step), transient=0.0, filter_length=0.0)
+
+
+def free_crawler(cells: int, time_step: float) -> Scene:
+    """The crawler in the total Lagrangian formulation, between layers."""
+    scene = crawler_on_ground(cells, time_step, 2.0)
+    return replace(scene, steps=round(1.0 / time_step), transient=0.0, filter_length=0.0)
+
+
 CASES = {"walker": roomy_walker, "crawler": crawler}
+TOTAL_CASES = {"walker": free_walker, "crawler": free_crawler}
 
 
 def courant_scene(
-    case: str, courant: float, cells: int = 64, material: Material | None = None
+    case: str,
+    courant: float,
+    cells: int = 64,
+    material: Material | None = None,
+    formulation: Formulation = "updated",
 ) -> Scene:
     """A case whose Courant number is at most so much."""
     material = material or Material()
     steps = math.ceil(material.wave_speed * cells / courant)
-    return replace(CASES[case](cells, 1.0 / steps), material=material)
+    make = (CASES if formulation == "updated" else TOTAL_CASES)[case]
+    rest = make(cells, 1e-4)  # viscosity may not bear the step, and goes
+    return replace(rest, material=material, time_step=1.0 / steps, steps=steps)
 
 
 def patches(positions: Array, seed: int) -> np.ndarray:
@@ -58,10 +80,10 @@ def patches(positions: Array, seed: int) -> np.ndarray:
     return np.cos(positions @ waves + rng.uniform(0.0, 2.0 * np.pi, 30)).sum(axis=1) > -1.0
 
 
-def actuation(seed: int) -> Variables:
-    """Full amplitude, random phase and bias."""
+def actuation(scene: Scene, seed: int) -> Variables:
+    """Full amplitude, random phase and bias, and the actuator's own frequency."""
     theta, b = np.random.default_rng(1000 + seed).uniform(-1.0, 1.0, (2, 1))
-    return Variables(np.zeros(0), np.ones(1), theta, b)
+    return Variables(np.zeros(0), np.ones(1), theta, b, np.zeros(sizes(scene)[-1]))
 
 
 def with_void(scene: Scene, there: np.ndarray, variables: Variables) -> float:
@@ -75,14 +97,20 @@ def with_void(scene: Scene, there: np.ndarray, variables: Variables) -> float:
     particles = discretise(scene)
     gamma = np.ones(len(particles.position))
     gamma[particles.designed] = there
-    given = signal(scene, variables.a, variables.theta, variables.b)
-    simulation = Simulation(scene, particles, *interpolate(scene.material, gamma), given)
+    material = interpolate(scene.material, gamma)
+    simulation = simulation_of(scene, particles, *material, variables.signal(scene))
     return float(Objective.of(scene, particles).centroid(simulation.run()))
 
 
 def floors(epsilon: float, heavy: bool) -> Material:
     """Both floors equal, or a heavy one for mass."""
     return Material(void_stiffness=epsilon, void_density=HEAVY if heavy else epsilon)
+
+
+def free_floors(epsilon: float, heavy: bool) -> Material:
+    """Both floors equal, or that of mass ten times as high, as in `presets.gait`; viscous."""
+    density = min(1.0, 10.0 * epsilon) if heavy else epsilon
+    return Material(void_stiffness=epsilon, void_density=density, viscosity=VISCOSITY)
 
 
 def limit_at_rest(material: Material) -> float:
@@ -99,26 +127,33 @@ def limit_at_rest(material: Material) -> float:
 
 
 def one_square(
-    case: str, courant: float, epsilon: float, heavy: bool, designs: int
+    case: str,
+    courant: float,
+    epsilon: float,
+    heavy: bool,
+    designs: int,
+    formulation: Formulation = "updated",
 ) -> dict[str, Any]:
     """Random designs with void, each against the same body without it."""
-    material = floors(epsilon, heavy)
+    material = floors(epsilon, heavy) if formulation == "updated" else free_floors(epsilon, heavy)
     row: dict[str, Any] = {
-        "case": case, "courant": courant, "void_stiffness": material.void_stiffness,
-        "void_density": material.void_density, "refused": False, "designs": 0, "failed": 0,
+        "formulation": formulation, "case": case, "courant": courant,
+        "void_stiffness": material.void_stiffness, "void_density": material.void_density,
+        "refused": False, "designs": 0, "failed": 0,
         "median_deviation": np.nan, "largest_deviation": np.nan, "error": "",
     }  # fmt: skip
     try:
-        scene = courant_scene(case, courant, material=material)
+        scene = courant_scene(case, courant, material=material, formulation=formulation)
     except SceneError as error:
         return row | {"refused": True, "error": str(error)}
     particles = discretise(scene)
     away = []
     for seed in range(designs):
-        there, variables = patches(particles.position[particles.designed], seed), actuation(seed)
-        alone = distance(scene, there, variables)
+        there = patches(particles.position[particles.designed], seed)
+        variables = actuation(scene, seed)
         row["designs"] += 1
         try:
+            alone = distance(scene, there, variables)
             away.append(abs(with_void(scene, there, variables) - alone))
         except SimulationError as error:
             row["failed"] += 1
@@ -139,12 +174,20 @@ def points(quick: bool) -> Points:
         for courant in (COURANTS[2::2] if quick else COURANTS)
         if not (heavy and epsilon == HEAVY)  # is among the equal ones
     ]  # fmt: skip
+    squares += [
+        {"case": case, "courant": courant, "epsilon": epsilon, "heavy": heavy, "designs": 2,
+         "formulation": "total"}
+        for case in TOTAL_CASES
+        for heavy in (False, True)
+        for epsilon in (EPSILONS[2:3] if quick else EPSILONS[1:4])
+        for courant in TOTAL_COURANTS
+    ]  # fmt: skip
     return {one_square: squares}
 
 
 def measure(measured: Measured) -> Found:
     """The map, and how it sums up for equal floors and for a heavy void density."""
-    rows = measured[one_square]
+    rows = [r for r in measured[one_square] if r["formulation"] == "updated"]
     lines = []
     for heavy in (False, True):
         mine = [r for r in rows if (r["void_density"] == HEAVY) is heavy or not heavy]
@@ -177,4 +220,25 @@ def measure(measured: Measured) -> Found:
         lines.append(
             Line(f"Weak particles beside stressed solid, {name}", theory, said, program.strip())
         )
-    return Found({"weak": rows}, lines)
+    for heavy in (False, True):
+        ran = [
+            r
+            for r in measured[one_square]
+            if r["formulation"] == "total"
+            and not r["refused"]
+            and (r["void_density"] > r["void_stiffness"]) is heavy
+        ]
+        failed = [r for r in ran if r["failed"]]
+        said = f"{sum(r['failed'] for r in ran)} of {sum(r['designs'] for r in ran)} runs fail"
+        for courant in TOTAL_COURANTS:
+            some = [r for r in ran if r["courant"] == courant]
+            said += f", {sum(r['failed'] for r in some)} at Courant {courant:g}"
+        away = [r["largest_deviation"] for r in ran if r["void_stiffness"] <= SAFE_STIFFNESS]
+        said += f"; with a stiffness of {SAFE_STIFFNESS:g} or less the others' void moves the "
+        said += f"objective by at most {np.nanmax(away):.4f}"
+        how = "10 times the void stiffness" if heavy else "equal to the void stiffness"
+        name = f"Weak particles beside stressed solid, total Lagrangian, void density {how}"
+        says = sorted({r["error"].split("; ")[0].split(": ")[-1] for r in failed})
+        program = f"SimulationError: {', '.join(says)}." if failed else "Runs."
+        lines.append(Line(name, "", said, program))
+    return Found({"weak": measured[one_square]}, lines)

@@ -22,16 +22,16 @@ from mpmopt.errors import DesignError, RunFileError, StorageError
 from mpmopt.io.console import say
 from mpmopt.io.files import locked, make_folder, refuse_existing, replace_file
 from mpmopt.io.pictures import read_picture
-from mpmopt.io.progress import Progress
 from mpmopt.optimisation.history import Optimisation
 from mpmopt.optimisation.loop import HOW, begin, go_on
-from mpmopt.optimisation.settings import Settings
+from mpmopt.optimisation.settings import FLOORS, Settings
 from mpmopt.results import runfile
 from mpmopt.scene import Scene
 from mpmopt.scene.particles import discretise
 from mpmopt.scene.scene import Formulation
 from mpmopt.simulation.checkpoints import Checkpointing
-from mpmopt.validation import digits, instance, place, shown
+from mpmopt.validation import instance, place, shown
+from mpmopt.view.live import ProgressBar
 
 logger = logging.getLogger(__name__)
 
@@ -93,44 +93,14 @@ class Case:
             stages = tuple(
                 replace(
                     stage,
-                    void_density=max(stage.void_density, 1e-2),
-                    void_stiffness=max(stage.void_stiffness, 1e-3),
+                    void_density=max(stage.void_density or 0.0, FLOORS[formulation][0]),
+                    void_stiffness=max(stage.void_stiffness or 0.0, FLOORS[formulation][1]),
                     void_cutoff=0.05 if stage.solid else stage.void_cutoff,
                 )
                 for stage in stages
             )
         scene = replace(self.scene, formulation=formulation)
         return replace(self, scene=scene, settings=replace(self.settings, stages=stages))
-
-
-class ProgressBar:
-    """Callback of `optimise` that shows how far it is; log lines off a terminal."""
-
-    def __init__(self) -> None:
-        self._progress = Progress("evaluations")
-        self._origin: float | None = None
-
-    def __call__(self, run: Optimisation) -> None:
-        if run.stop_reason:
-            self._progress.close()
-            return
-        if self._origin is None:
-            self._origin = run.origin
-        last = run.history[-1]
-        self._progress.count = len(run.history) - 1
-        self._progress.total = most_evaluations(run)
-        self._progress.step(
-            f"{run.measure} {digits(last.objective - self._origin, 3)}, beta {last.beta:g}, "
-            f"non-discreteness {last.non_discreteness:.2f}"
-        )
-
-
-def most_evaluations(run: Optimisation) -> int:
-    """How many evaluations a run will have had if no stage ends early from now on."""
-    settings, now = run.settings, run.stage
-    limits = [stage.most_iterations or settings.most_iterations for stage in settings.stages]
-    done = sum(item.stage == now and not item.failure for item in run.history)
-    return len(run.history) + max(limits[now] - done, 0) + sum(limits[now + 1 :])
 
 
 def run(
@@ -159,7 +129,8 @@ def run(
     phi : callable, optional
         Of positions (D, 2): phi (D,) that a run begins with, instead of the case's.
     full_study : bool, optional
-        Try the finished robot in all ways of `robustness.study`, not only in some.
+        Try the finished robot in all ways of `robustness.study`, not only in some. The run file
+        remembers it, for `resume`.
 
     Returns
     -------
@@ -202,10 +173,11 @@ def run(
                     f"{path} holds an earlier run of another case; choose another folder, or "
                     "--force to replace it"
                 )
-            return _go_on(path, kept, checkpointing, full_study)
+            kept = replace(kept, full_study=full_study or kept.full_study)
+            return _go_on(path, kept, checkpointing)
         refuse_existing((folder / name for name in RESULTS), force)
-        runfile.write(path, new, baseline=baseline)
-        return _go_on(path, runfile.read_run(path), checkpointing, full_study)
+        runfile.write(path, new, baseline=baseline, full_study=full_study)
+        return _go_on(path, runfile.read_run(path), checkpointing)
 
 
 def resume(
@@ -255,10 +227,7 @@ def baseline_particles(case: Case) -> NDArray[np.bool_]:
 
 
 def _go_on(
-    path: Path,
-    kept: runfile.RunFile,
-    checkpointing: Checkpointing | None,
-    full_study: bool = False,
+    path: Path, kept: runfile.RunFile, checkpointing: Checkpointing | None
 ) -> dict[str, Any]:
     if kept.summary:
         say(f"{path} holds a finished run.")
@@ -268,14 +237,14 @@ def _go_on(
     if kept.run.history:
         say(f"Going on after {len(kept.run.history)} evaluations.")
 
-    def save(current: Optimisation) -> None:
-        runfile.write(path, current, baseline=kept.baseline)
+    def save(current: Optimisation, summary: Mapping[str, Any] | None = None) -> None:
+        runfile.write(path, current, summary, kept.baseline, kept.full_study)
 
     result = go_on(kept.run, [save, ProgressBar()], checkpointing)
-    summary = summarise(result, kept.baseline, full_study)
+    summary = summarise(result, kept.baseline, kept.full_study)
     text = json.dumps(summary, indent=1) + "\n"
     replace_file(path.parent / "summary.json", text.encode())
-    runfile.write(path, result, summary, kept.baseline)
+    save(result, summary)
     drawn = RESULTS[1:] if "speed" in summary else RESULTS[1:4]
     for name in drawn:
         draw_or_warn(path.parent / name, lambda target: _draw(target, result, summary, path))

@@ -25,7 +25,6 @@ from mpmopt.optimisation.loop import check_body_fits
 from mpmopt.optimisation.settings import Settings
 from mpmopt.results import runfile
 from mpmopt.scene import Design, Scene
-from mpmopt.scene.particles import discretise
 from mpmopt.validation import count, digits, instance, place
 
 logger = logging.getLogger(__name__)
@@ -94,8 +93,13 @@ def one_start(
     folder.mkdir(parents=True, exist_ok=True)
     # Paths may hold what is no text.
     log = (folder / "log.txt").open("a", buffering=1, encoding="utf-8", errors="backslashreplace")
+    own, noise = np.asarray(start["phi"], dtype=float), random_start(case.scene, seed)
+
+    def phi(position: NDArray) -> NDArray[np.float64]:
+        return np.clip(own + noise(position), -1.0, 1.0)
+
     with log, contextlib.redirect_stderr(log):
-        summary = run(case, folder, phi=random_start(case.scene, seed) if seed else None)
+        summary = run(case, folder, phi=phi if seed else None)
 
     def number(value: float | None) -> float:
         return math.nan if value is None else float(value)
@@ -127,10 +131,10 @@ def multistart(
 ) -> str:
     """Optimise a case from several starts: its own, and random ones with seeds 1, 2, ...
 
-    The random ones replace the case's phi (`random_start`). Starts run side by side. Leaves
-    ``start-0``, ``start-1``, ..., one folder for each; the numbers in ``starts.h5`` (`sweeps`) and
-    ``starts.csv``; and ``starts.png``. A start whose numbers are there is not run again; one that
-    was stopped is gone on with.
+    The random ones add a smooth random field to the case's phi (`random_start`). Starts run side by
+    side. Leaves ``start-0``, ``start-1``, ..., one folder for each; the numbers in ``starts.h5``
+    (`sweeps`) and ``starts.csv``; and ``starts.png``. A start whose numbers are there is not run
+    again; one that was stopped is gone on with.
 
     Parameters
     ----------
@@ -166,9 +170,8 @@ def multistart(
     if not (out / "starts.h5").exists():
         refuse_existing((table, picture), force)
     start = dict(case.start)
-    if callable(start["phi"]):
-        particles = discretise(case.settings.stages[0].scene(case.scene))
-        start["phi"] = start["phi"](particles.position[particles.designed])
+    problem = case.settings.stages[0].problem(case.scene)
+    start["phi"] = problem.split(problem.join(**start)).phi
     plan = {
         "scene": case.scene.to_json(),
         "settings": dataclasses.asdict(case.settings),

@@ -12,6 +12,7 @@ from mpmopt.app.summary import table
 from mpmopt.assess import robustness
 from mpmopt.errors import DesignError
 from mpmopt.io.files import locked, replace_file
+from mpmopt.io.notebook import Place, in_notebook
 from mpmopt.io.progress import Progress
 from mpmopt.results import runfile
 from mpmopt.validation import digits, place
@@ -49,6 +50,8 @@ def full_study(path: str | os.PathLike[str]) -> str:
         if "followed" not in summary:
             problem, x = kept.run.problem(), kept.run.result.x
             with Progress("simulations") as progress:
+                if in_notebook():
+                    Place().show(kept.run)
 
                 def show(name: str, speed: float) -> None:
                     progress.step(f"{name}: {'failed' if math.isnan(speed) else digits(speed, 3)}")
@@ -56,7 +59,7 @@ def full_study(path: str | os.PathLike[str]) -> str:
                 summary |= robustness.study(problem, x, full=True, progress=show)
             text = json.dumps(summary, indent=1) + "\n"
             replace_file(path.parent / "summary.json", text.encode())
-            runfile.write(path, kept.run, summary, kept.baseline)
+            runfile.write(path, kept.run, summary, kept.baseline, kept.full_study)
         if "speed" in summary:
             from mpmopt.view.gait import plot_robustness
 

@@ -46,7 +46,7 @@ def summarise(
     """
     instance("summarise", "result", result, Optimisation)
     best, problem = result.result, result.problem()
-    _, *others = rows = study(problem, best.x)
+    designed, *others = rows = study(problem, best.x)
     first = result.first
     assert first is not None
     actuations = [Variables.of(item.x, problem.scene) for item in (first, best)]
@@ -68,7 +68,10 @@ def summarise(
             lambda: best_actuated(problem.scene, lambda _: baseline, *actuations, task=result.task)
         ),
         "optimised": best.objective,
-        "post_processed": _value_or_none(lambda: post_processed(problem, best.x)),
+        # The row has none where the reference failed.
+        "post_processed": _value_or_none(lambda: post_processed(problem, best.x))
+        if designed.failure
+        else _number_or_none(designed.distance),
         "actuation_off": _value_or_none(lambda: unactuated(problem, best.x)),
         "cost_of_transport": None
         if not any(problem.scene.gravity)

@@ -6,16 +6,19 @@ on, and compared with the finest that is affordable.
 
 from __future__ import annotations
 
+import itertools
 import math
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cache
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mpmopt.assess.refinement import other_formulation
 from mpmopt.assess.threshold import NO_GAIN
 from mpmopt.design.problem import Problem
 from mpmopt.design.step_control import LIMITS
@@ -25,6 +28,7 @@ from mpmopt.design.variables import Variables
 from mpmopt.errors import DesignError, SceneError, SimulationError
 from mpmopt.scene import Actuator, Grid, Mirror, Scene
 from mpmopt.scene.particles import mirror_images
+from mpmopt.scene.scene import Formulation
 from mpmopt.simulation.checkpoints import Checkpointing
 from mpmopt.simulation.indicators import Indicators
 from mpmopt.simulation.simulation import Precision
@@ -37,6 +41,8 @@ COURANTS = (0.8, 0.6, 0.4, 0.2, 0.1)
 # Cell counts are tried in these multiples of the scene's own; the reference is the last affordable.
 MULTIPLES = (0.25, 0.5, 0.75, 1.0, 1.5, 2.0)
 REFERENCE_COURANT = 0.4
+# Of a candidate: multiple of the cells, particles per cell, Courant number, formulation.
+Key = tuple[float, int, float, Formulation]
 
 
 @dataclass(frozen=True)
@@ -54,6 +60,8 @@ class Discretisation:
     precision : "double" or "single"
     mirror : Mirror or None
         Plane of symmetry below which the body is simulated.
+    formulation : "updated" or "total"
+        As in `Scene`.
     """
 
     cells: tuple[int, int]
@@ -61,11 +69,15 @@ class Discretisation:
     particles_per_cell: int = 2
     precision: Precision = "double"
     mirror: Mirror | None = None
+    formulation: Formulation = "updated"
 
     def __str__(self) -> str:
         (nx, ny), k = self.cells, self.particles_per_cell
         half = ", half the body" if self.mirror else ""
-        return f"{nx} x {ny} cells, {self.steps} steps, {k} x {k} a cell, {self.precision}{half}"
+        return (
+            f"{self.formulation}, {nx} x {ny} cells, {self.steps} steps, {k} x {k} a cell, "
+            f"{self.precision}{half}"
+        )
 
     @classmethod
     def of(
@@ -84,7 +96,13 @@ class Discretisation:
         courant = scene.courant if courant is None else courant
         steps = scene.duration * scene.wave_speed * multiple / scene.grid.dx / courant
         cells = round(nx), round(ny)
-        own = cls(cells, math.ceil(steps - 1e-6), scene.particles_per_cell, mirror=scene.mirror)
+        own = cls(
+            cells,
+            math.ceil(steps - 1e-6),
+            scene.particles_per_cell,
+            mirror=scene.mirror,
+            formulation=scene.formulation,
+        )
         return replace(own, **changes)
 
     def scene(self, scene: Scene) -> Scene:
@@ -93,7 +111,8 @@ class Discretisation:
         Raises
         ------
         SceneError
-            If it cannot be: edges between particles, a step that is too long.
+            If it cannot be: edges between particles, a step that is too long, walls in the total
+            Lagrangian formulation.
         """
         return replace(
             scene,
@@ -102,6 +121,7 @@ class Discretisation:
             steps=self.steps,
             particles_per_cell=self.particles_per_cell,
             mirror=self.mirror,
+            formulation=self.formulation,
         )
 
     def problem(self, scene: Scene, beta: float, **options: Any) -> Problem:
@@ -256,7 +276,7 @@ def measure(
         start = problem.task.maximise.value(Outcome(simulation, problem.gamma(x), rest))
         with simulation.checkpoints(problem.checkpointing) as store:
             schedule = store.schedule
-        _compile(discretisation.precision)
+        _compile(discretisation.precision, discretisation.formulation)
         evaluation, seconds = timed(lambda: problem.evaluate(x), repeats)
     except (SceneError, SimulationError) as error:
         return Measured(discretisation, failure=str(error))
@@ -273,10 +293,11 @@ def measure(
 
 
 @cache
-def _compile(precision: Precision) -> None:
+def _compile(precision: Precision, formulation: Formulation) -> None:
     """Compile the kernels, or load them, before a measurement would."""
     scene = Scene(Grid((8, 8), 1.0), 1e-3, 2, (Actuator((2.0, 2.0), (4.0, 4.0)),))
-    problem = Discretisation.of(scene, precision=precision).problem(scene, 1.0)
+    here = Discretisation.of(scene, precision=precision, formulation=formulation)
+    problem = here.problem(scene, 1.0)
     problem.value_and_gradient(problem.join(np.empty(0), 1.0, 0.0, 0.0))
 
 
@@ -288,7 +309,7 @@ class Evidence:
     ----------
     measured : Measured
     objective_error, gradient_error : float
-        Relative to the reference's.
+        Relative to those of the reference in the same formulation.
     angle : float
         Between the two gradients, in degrees.
     within : bool
@@ -304,10 +325,10 @@ class Evidence:
     def __str__(self) -> str:
         name = f"{self.measured.discretisation}"
         if self.measured.failure:
-            return f"{name:<63}  failed: {self.measured.failure}"
+            return f"{name:<72}  failed: {self.measured.failure}"
         angle = "  none" if math.isnan(self.angle) else f"{self.angle:5.1f} deg"
         return (
-            f"{name:<63}  {self.measured.seconds:8.3f} s  travel {self.measured.travel:10.4g}  "
+            f"{name:<72}  {self.measured.seconds:8.3f} s  travel {self.measured.travel:10.4g}  "
             f"off by {self.objective_error:7.2%}  gradient {self.gradient_error:7.2%}, "
             f"{angle:<9}  {'within' if self.within else ''}"
         )
@@ -320,12 +341,16 @@ class Cheapest:
     Attributes
     ----------
     best : Discretisation
-        The cheapest within the tolerance; the reference itself if nothing cheaper is.
+        The cheapest within the tolerance; the scene's own formulation's reference if none is.
     reference : Measured
-        The finest affordable.
+        The finest affordable in the formulation of the best.
     objective_uncertainty, gradient_uncertainty : float
         How far the next coarser cells at the same Courant number are from the reference: a
         tolerance below these says more than the reference knows.
+    other_reference : Measured or None
+        The finest affordable in the other formulation; None where the scene has only one.
+    objective_apart, gradient_apart : float
+        How far that is from the reference: what the formulations disagree by, or not a number.
     rows : tuple of Evidence
         All that was measured besides, in this order.
     tolerance, gradient_tolerance : float
@@ -336,6 +361,9 @@ class Cheapest:
     reference: Measured
     objective_uncertainty: float
     gradient_uncertainty: float
+    other_reference: Measured | None
+    objective_apart: float
+    gradient_apart: float
     rows: tuple[Evidence, ...]
     tolerance: float
     gradient_tolerance: float
@@ -353,12 +381,23 @@ class Cheapest:
             for name, own, asked in parts
             if asked < math.inf and not own <= asked
         ]
-        if not unknown:
-            return ""
-        return (
-            f"The reference itself knows {'; '.join(unknown)}: what is within that of it may be "
-            "further from the truth. Allow more seconds, give a scene with finer cells, or ask "
-            "for less."
+        apart = [
+            f"{name} by {own:.3g}"
+            for name, own, asked in (
+                ("travel", self.objective_apart, self.tolerance),
+                ("the gradient", self.gradient_apart, self.gradient_tolerance),
+            )
+            if own > asked
+        ]
+        said = ""
+        if unknown:
+            said = f"The reference itself knows {'; '.join(unknown)}"
+        if apart:
+            said += "; the" if said else "The"
+            said += f" references of both formulations differ in {', in '.join(apart)}"
+        return said and (
+            f"{said}: what is within that of it may be further from the truth. Allow more "
+            "seconds, give a scene with finer cells, or ask for less."
         )
 
 
@@ -406,10 +445,11 @@ def cheapest(
 ) -> Cheapest:
     """The cheapest discretisation whose objective and gradient are within a tolerance.
 
-    The finest cells that are affordable, up to twice the scene's own along each axis, at the
-    largest Courant number up to 0.4 that does not fail, are the reference. The others are measured
-    in order of their work, particles times steps, until one is within the tolerance and its
-    neighbour with the next finer cells is too, so that no error that only happens to vanish is
+    Of both formulations where the scene can be laid out in both, else of its own. In each, the
+    finest cells that are affordable, up to twice the scene's own along each axis, at the largest
+    Courant number up to 0.4 that does not fail, are the reference. The others are measured in order
+    of what they should take, until one is within the tolerance of its formulation's reference and
+    its neighbour with the next finer cells is too, so that no error that only happens to vanish is
     taken for accuracy. What goes beyond `step_control.LIMITS` counts as failed. Single precision
     is tried where double suffices, and taken where it took less time; one half is simulated where
     scene and design are symmetric. The filter keeps the scene's length.
@@ -426,7 +466,7 @@ def cheapest(
     gradient_tolerance : float, optional
         Another tolerance for the gradient; infinity leaves it out.
     seconds : float, optional
-        Processor time that the reference may take.
+        Processor time that each reference may take.
     progress : callable, optional
         Called with each line of evidence.
     task : Task, optional
@@ -464,65 +504,92 @@ def cheapest(
         return found[item]
 
     own = Discretisation.of(scene, mirror=plane)
-    in_order = sorted(grid.items(), key=lambda pair: _work(pair[1]))
-    tried = (result(item) for item in (own, *(item for _, item in in_order)))
-    first = next((measured for measured in tried if not measured.failure), None)
-    if first is None:
-        raise DesignError(f"cheapest: nothing could be simulated: {result(own).failure}")
-    pace = first.seconds / _work(first.discretisation)
-    affordable = [
-        key
-        for key, item in grid.items()
-        if key[1] == scene.particles_per_cell
-        and key[2] <= REFERENCE_COURANT
-        and not pace * _work(item) > seconds
-    ]
-    affordable.sort(key=lambda key: (key[0], key[2]), reverse=True)
-    at = next((key for key in affordable if not result(grid[key]).failure), None)
-    if at is None:
-        failures = {result(grid[key]).failure for key in affordable}
-        raise DesignError(
-            f"cheapest: no reference could be simulated within seconds = {seconds:g}: "
-            f"{'; '.join(failures) or 'allow more'}"
-        )
-    reference = result(grid[at])
+    pace: dict[Formulation, float] = {}
+
+    def finest(formulation: Formulation) -> Key:
+        """The finest cells of a formulation that are affordable and do not fail."""
+        mine = [key for key in grid if key[3] == formulation]
+        tried = sorted((grid[key] for key in mine), key=_work)
+        if formulation == scene.formulation:
+            tried.insert(0, own)
+        first = next((item for item in tried if not result(item).failure), None)
+        if first is None:
+            raise DesignError(f"cheapest: nothing could be simulated: {result(own).failure}")
+        pace[formulation] = result(first).seconds / _work(first)
+        affordable = [
+            key
+            for key in mine
+            if key[1] == scene.particles_per_cell
+            and key[2] <= REFERENCE_COURANT
+            and not pace[formulation] * _work(grid[key]) > seconds
+        ]
+        affordable.sort(reverse=True)
+        at = next((key for key in affordable if not result(grid[key]).failure), None)
+        if at is None:
+            failures = {result(grid[key]).failure for key in affordable}
+            raise DesignError(
+                f"cheapest: no reference could be simulated within seconds = {seconds:g}: "
+                f"{'; '.join(failures) or 'allow more'}"
+            )
+        return at
+
+    references = {scene.formulation: finest(scene.formulation)}
+    with suppress(DesignError):
+        other = other_formulation(scene)
+        references[other] = finest(other)
     rows: dict[Discretisation, Evidence] = {}
+
+    def reference_of(item: Discretisation) -> Measured:
+        return result(grid[references[item.formulation]])
 
     def within(item: Discretisation) -> bool:
         if item not in rows:
             measured = result(item)
-            objective, gradient, angle = measured.errors(reference)
+            objective, gradient, angle = measured.errors(reference_of(item))
             fits = objective <= tolerance and not gradient > gradient_tolerance
             rows[item] = Evidence(measured, objective, gradient, angle, fits)
             if progress is not None:
                 progress(rows[item])
         return rows[item].within
 
-    within(reference.discretisation)
+    def expected(item: Discretisation) -> float:
+        return pace[item.formulation] * _work(item)
+
     within(own)
-    below = [key for key in grid if key[0] < at[0] and key[1:] == at[1:]]
-    coarser = grid[max(below)] if below else None
-    if coarser is not None:
-        within(coarser)
-    best = reference.discretisation
-    for key, item in in_order:
-        if _work(item) >= _work(best):
+    coarser: dict[Formulation, Discretisation] = {}
+    for formulation, at in references.items():
+        within(grid[at])
+        below = [key for key in grid if key[0] < at[0] and key[1:] == at[1:]]
+        if below:
+            coarser[formulation] = grid[max(below)]
+            within(coarser[formulation])
+    best = grid[references[scene.formulation]]
+    candidates = [key for key in grid if key[3] in references and key[0] <= references[key[3]][0]]
+    for key in sorted(candidates, key=lambda key: expected(grid[key])):
+        item = grid[key]
+        if expected(item) >= expected(best):
             break
-        if key[0] > at[0]:
-            continue
-        finer = [other for other in grid if key[0] < other[0] <= at[0] and other[1:] == key[1:]]
+        finer = [other for other in candidates if key[0] < other[0] and other[1:] == key[1:]]
         if within(item) and (not finer or within(grid[min(finer)])):
             best = item
     single = replace(best, precision="single")
-    if within(single) and result(single).seconds < result(best).seconds:
+    in_single = best.formulation == "updated" and within(single)  # the other one has no single
+    if in_single and result(single).seconds < result(best).seconds:
         best = single
     if plane is not None and scene.mirror is None:
         within(replace(best, mirror=None))
+    reference, known, apart = reference_of(best), (math.nan, math.nan), (math.nan, math.nan)
+    if best.formulation in coarser:
+        known = result(coarser[best.formulation]).errors(reference)[:2]
+    others = [result(grid[at]) for name, at in references.items() if name != best.formulation]
+    if others:
+        apart = others[0].errors(reference)[:2]
     return Cheapest(
         best,
         reference,
-        rows[coarser].objective_error if coarser else math.nan,
-        rows[coarser].gradient_error if coarser else math.nan,
+        *known,
+        others[0] if others else None,
+        *apart,
         tuple(rows.values()),
         tolerance,
         gradient_tolerance,
@@ -542,29 +609,25 @@ def filter_reach(scene: Scene) -> float:
     return scene.grid.dx * math.sqrt(0.5 + 2.0 * (w1 + 2.0 * w2) * scene.filter_passes)
 
 
-def _candidates(
-    scene: Scene, plane: Mirror | None
-) -> dict[tuple[float, int, float], Discretisation]:
-    """All in double precision that the scene can be laid out in.
-
-    By multiple of the cells, particles per cell and Courant number.
-    """
+def _candidates(scene: Scene, plane: Mirror | None) -> dict[Key, Discretisation]:
+    """All in double precision that the scene can be laid out in."""
     grid = {}
-    for multiple in MULTIPLES:
+    for multiple, formulation in itertools.product(MULTIPLES, get_args(Formulation)):
         for per_cell in sorted({2, 3, scene.particles_per_cell}):
             for courant in COURANTS:
                 try:
                     item = Discretisation.of(
-                        scene, multiple, courant, particles_per_cell=per_cell, mirror=plane
-                    )
+                        scene, multiple, courant, particles_per_cell=per_cell, mirror=plane,
+                        formulation=formulation,
+                    )  # fmt: skip
                     item.scene(scene)
                 except SceneError:
                     continue
-                grid[multiple, per_cell, courant] = item
+                grid[multiple, per_cell, courant, formulation] = item
     return grid
 
 
 def _work(item: Discretisation) -> float:
-    """What cost is proportional to: particles of a full grid, times steps."""
+    """What cost is proportional to in a formulation: particles of a full grid, times steps."""
     half = 0.5 if item.mirror else 1.0
     return half * math.prod(item.cells) * item.particles_per_cell**2 * item.steps

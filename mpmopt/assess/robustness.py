@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import label
 
 from mpmopt.assess import threshold
-from mpmopt.assess.refinement import other_formulation
+from mpmopt.assess.refinement import other_formulation, with_twice_the_step
 from mpmopt.assess.threshold import SOLID_LIMITS, solid_body
 from mpmopt.design.actuation import frequencies
 from mpmopt.design.ensemble import side_by_side
@@ -32,7 +32,7 @@ from mpmopt.scene.particles import Particles, discretise, mirror_images, nearest
 from mpmopt.scene.scene import LAGRANGIAN_LIMIT, Formulation
 from mpmopt.simulation.simulation import Simulation
 
-# In the scene's unit of time: what comes before does not count, and when a speed has been seen.
+# In units of `unit`: what comes before does not count, and when a speed has been seen.
 SETTLED, SEEN, FOLLOWED = 2.0, 8.0, 20.0
 FEW_FRICTIONS = (0.2, 0.35, 0.5, 0.8)
 FRICTIONS = (0.2, 0.3, 0.35, 0.5, 0.65, 0.8, 1.5)
@@ -109,6 +109,11 @@ def can_be_studied(scene: Scene) -> bool:
     return bool(scene.actuators and scene.ground)
 
 
+def unit(scene: Scene) -> float:
+    """The unit of this file's times: the scene's transient, or its unit of time if it has none."""
+    return scene.transient or 1.0
+
+
 def whole_periods(period: float, begin: float, end: float) -> float:
     """The time until which as many whole periods have passed since `begin` as there is room for."""
     return begin + max(1, math.floor((end - begin) / period + 1e-9)) * period
@@ -148,11 +153,14 @@ def _moved(scene: Scene, dx: float, dy: float) -> dict[str, Any]:
     }
 
 
-def refined(scene: Scene, multiple: float = 1.0, formulation: Formulation | None = None) -> Scene:
+def with_cells(
+    scene: Scene, multiple: float = 1.0, formulation: Formulation | None = None
+) -> Scene:
     """The scene with so many times its cells along each axis, and in another formulation.
 
-    The step is as much shorter as cells are narrower, and shorter still where viscosity or a layer
-    need that. It has no design filter, which no solid body needs.
+    The step is as much shorter as cells are narrower (`variation.refined` leaves it at that, so
+    that only cells differ), and shorter still where viscosity or a layer need that. It has no
+    design filter, which no solid body needs.
 
     Raises
     ------
@@ -198,8 +206,8 @@ class Trial(NamedTuple):
 def speed(robot: Robot, trial: Trial, most_work: float = math.inf) -> float:
     """Mean speed of a robot along the direction of travel, over whole periods.
 
-    From `SETTLED` to `SEEN`, or from `RECOVERED` where it is pushed: its solid and actuators'
-    centroid at the end, less that at the beginning, over the time between.
+    From `SETTLED` to `SEEN`, or from `RECOVERED` where it is pushed, in units of `unit`: its solid
+    and actuators' centroid at the end, less that at the beginning, over the time between.
 
     Raises
     ------
@@ -207,8 +215,9 @@ def speed(robot: Robot, trial: Trial, most_work: float = math.inf) -> float:
         If that cannot be simulated, or goes beyond `threshold.SOLID_LIMITS`, or takes too long.
     """
     scene = trial.scene()
-    begin = RECOVERED if trial.pushed else SETTLED
-    end = whole_periods(robot.period(scene), begin, SEEN)
+    one = unit(scene)
+    begin = one * (RECOVERED if trial.pushed else SETTLED)
+    end = whole_periods(robot.period(scene), begin, one * SEEN)
     scene = lasting(scene, end)
     simulation = robot.body(scene)
     work = float(simulation.initial.shape[1]) * scene.steps
@@ -218,7 +227,7 @@ def speed(robot: Robot, trial: Trial, most_work: float = math.inf) -> float:
     if trial.frozen:
         simulation.signal[first:] = simulation.signal[first]
     if trial.pushed:
-        past = round(PUSHED / scene.time_step)
+        past = round(one * PUSHED / scene.time_step)
         back = -PUSH * scene.wave_speed
         velocity = back * scene.direction[0], back * scene.direction[1]
         simulation = simulation.pushed(past, velocity)
@@ -237,7 +246,7 @@ class Followed:
     Attributes
     ----------
     seconds : float
-        Until it falls, stops or cannot be simulated, or `FOLLOWED`.
+        Until it falls, stops or cannot be simulated, or `FOLLOWED` times `unit`.
     end : str
         "goes on", "falls", "stops", or why it cannot be simulated.
     """
@@ -251,9 +260,10 @@ def follow(robot: Robot, scene: Scene) -> Followed:
 
     It falls where its solid and actuators, on the average, lean by 45 degrees, or their centroid is
     half as far from the ground as at first. It stops where it goes less than a tenth of its speed
-    for two seconds.
+    for `PAUSE` times `unit`.
     """
-    scene = lasting(scene, FOLLOWED)
+    one = unit(scene)
+    scene = lasting(scene, one * FOLLOWED)
     simulation = robot.body(scene)
     every = max(1, round(0.25 * robot.period(scene) / scene.time_step))
     frames = np.arange(0, scene.steps + 1, every)
@@ -269,18 +279,18 @@ def follow(robot: Robot, scene: Scene) -> Followed:
     if scene.mirror is None:  # of half a body both sides may lean
         fallen |= np.abs(angle) > LEANS
     time = time[: len(way)]
-    seen = np.flatnonzero((time >= SETTLED) & (time <= SEEN))
+    seen = np.flatnonzero((time >= one * SETTLED) & (time <= one * SEEN))
     first, last = (seen[0], seen[-1]) if seen.size > 1 else (0, -1)
     mean = max(float(way[last] - way[first]) / float(np.ptp(time[[first, last]]) or 1.0), 0.0)
-    pause = max(1, round(PAUSE / (every * scene.time_step)))
-    slow = way[pause:] - way[: len(way) - pause] <= SLOW * mean * PAUSE
+    pause = max(1, round(one * PAUSE / (every * scene.time_step)))
+    slow = way[pause:] - way[: len(way) - pause] <= SLOW * mean * one * PAUSE
     events = [(float(time[fallen.argmax()]), "falls")] if fallen.any() else []
-    late = np.flatnonzero(slow & (time[: len(slow)] >= SETTLED))
+    late = np.flatnonzero(slow & (time[: len(slow)] >= one * SETTLED))
     if late.size:
         events.append((float(time[late[0]]), "stops"))
     if failure is not None:
         events.append((failure.step * scene.time_step, failure.what))
-    return Followed(*min(events, default=(FOLLOWED, "goes on")))
+    return Followed(*min(events, default=(one * FOLLOWED, "goes on")))
 
 
 def track(
@@ -356,7 +366,8 @@ def study(
     -------
     dict
         ``speed``; ``speed_by_friction``, and where it is full ``speed_by_strength``,
-        ``speed_by_frequency``, ``speed_by_step`` (times the run's) and, of both formulations,
+        ``speed_by_frequency``, ``speed_by_step`` (times the run's,
+        as far as it is stable) and, of both formulations,
         ``speed_by_cells`` (along the grid's shorter side), by numbers as text; ``kept``, shares of
         the speed with half the step, with cells half as wide, and where it is full a quarter as
         wide, and half as wide in the other formulation; ``driven_share``, what is missing when the
@@ -426,7 +437,7 @@ def _trials(scene: Scene, full: bool) -> dict[str, Trial]:
     other = other_formulation(scene)
 
     def cells(multiple: float, formulation: Formulation | None = None) -> Trial:
-        return Trial(lambda: refined(scene, multiple, formulation))
+        return Trial(lambda: with_cells(scene, multiple, formulation))
 
     def steps(multiple: float) -> Trial:
         return Trial(lambda: replace(scene, time_step=multiple * scene.time_step))
@@ -445,7 +456,9 @@ def _trials(scene: Scene, full: bool) -> dict[str, Trial]:
         trials |= {"cells 4": cells(4.0), "other 2": cells(2.0, other)}
     trials |= {"cells 2": cells(2.0), "step 0.5": steps(0.5)}
     if full:
-        trials |= {"other 1": cells(1.0, other), "step 2": steps(2.0)}
+        trials["other 1"] = cells(1.0, other)
+        if with_twice_the_step(scene) is not None:
+            trials["step 2"] = steps(2.0)
         trials |= {"cells 0.5": cells(0.5), "other 0.5": cells(0.5, other)}
         trials |= {f"strength {value:g}": strength(value) for value in CHANGES}
         trials |= {f"frequency {value:g}": frequency(value) for value in CHANGES}

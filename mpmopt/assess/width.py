@@ -9,8 +9,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import brentq
+from scipy.special import ndtr, ndtri
 
 from mpmopt.errors import DesignError, MissingLibraryError
+from mpmopt.scene import Scene
 
 # Widths are sought from this share of the outline's diagonal on, in steps of this ratio.
 LEAST, RATIO = 1e-3, 1.15
@@ -19,6 +22,42 @@ SEGMENTS = 64  # of a disc
 GROWN = 1.02  # so that a disc of straight segments fills what a round one would
 # In which offsets are taken: the library rounds to a millionth of one.
 DIAGONAL = 1000.0
+
+
+def least_width(scene: Scene, threshold: float) -> float:
+    """Width of the thinnest straight bar that is there when the design is eroded.
+
+    The filter spreads a bar as a Gaussian of the same variance would (theory, eq. bar): so this is
+    the width, at a threshold of 1/2, of a bar whose filtered density just reaches `threshold`
+    (Wang, Lazarov and Sigmund, 2011; for a Gaussian). Of a gap that is there when the design is
+    dilated it is that of 1 - threshold. Along an edge of a design region both may be about half as
+    wide, since the filter sees nothing beyond.
+
+    Parameters
+    ----------
+    scene : Scene
+        Whose filter it is.
+    threshold : float
+        Of the eroded design, between 1/2 and 1.
+
+    Returns
+    -------
+    float
+        In the scene's unit of length.
+
+    Raises
+    ------
+    DesignError
+        If the threshold is not between 1/2 and 1.
+    """
+    if not 0.5 < threshold < 1.0:
+        raise DesignError(f"least_width: threshold = {threshold:g} must be between 1/2 and 1")
+    half = float(ndtri(0.5 * (1.0 + threshold)))  # of the bar before it is filtered
+
+    def beyond(edge: float) -> float:
+        return float(ndtr(edge + half) - ndtr(edge - half)) - 0.5
+
+    return 2.0 * scene.filter_spread * float(brentq(beyond, 0.0, half + 1.0, xtol=1e-14))
 
 
 def thinnest_member(rings: Sequence[NDArray[np.float64]], detail: float = 0.0) -> float:

@@ -9,6 +9,13 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
+from mpmopt.design.projection import (
+    lattice_differences,
+    project,
+    project_adjoint,
+    project_subpixel,
+    project_subpixel_adjoint,
+)
 from mpmopt.errors import DesignError
 from mpmopt.kernels import interpolation
 from mpmopt.scene import Material, Scene
@@ -104,34 +111,6 @@ def filter_matrix(
     return (matrix @ scipy.sparse.csr_array((ones, (np.arange(image.size), image)), shape)).tocsr()
 
 
-def project(phi: NDArray, beta: float, threshold: float = 0.5) -> NDArray:
-    """Smoothed Heaviside gamma, 0 at phi = -1 and 1 at phi = 1, steepest where (phi + 1) / 2 = eta.
-
-    The paper's gamma = (tanh(beta phi) / tanh(beta) + 1) / 2 at a threshold eta of 1/2; others
-    erode or dilate the design (Wang, Lazarov and Sigmund, 2011).
-    """
-    if threshold == 0.5:
-        return 0.5 * (np.tanh(beta * phi) / np.tanh(beta) + 1.0)
-    at, low, high = _edges(beta, threshold)
-    return (np.tanh(beta * (phi - at)) + low) / (low + high)
-
-
-def project_adjoint(
-    phi: NDArray, beta: float, gamma_bar: NDArray, threshold: float = 0.5
-) -> NDArray:
-    """phi_bar from gamma_bar."""
-    at, low, high = _edges(beta, threshold)
-    decay = np.exp(-np.abs(beta * (phi - at)))
-    sech = 2.0 * decay / (1.0 + decay**2)  # 1 - tanh^2 = sech^2, which does not cancel
-    return gamma_bar * beta / (low + high) * sech**2
-
-
-def _edges(beta: float, threshold: float) -> tuple[float, float, float]:
-    """The threshold on the scale of phi, and tanh(beta x) for the ways x from the ends to it."""
-    at = 2.0 * threshold - 1.0
-    return at, float(np.tanh(beta * (1.0 + at))), float(np.tanh(beta * (1.0 - at)))
-
-
 def non_discreteness(gamma: NDArray) -> float:
     """Mean of 4 gamma (1 - gamma): 0 for a black and white design, 1 for a uniformly grey one."""
     return float(np.mean(4.0 * gamma * (1.0 - gamma))) if gamma.size else 0.0
@@ -147,6 +126,8 @@ class DesignChain:
     particles : Particles
     beta : float
         Sharpness of the projection, > 0.
+    subpixel : bool, optional
+        Whether edges are as wide as a particle, whatever beta is (`projection.project_subpixel`).
 
     Attributes
     ----------
@@ -159,10 +140,14 @@ class DesignChain:
         If beta is not positive and finite.
     """
 
-    def __init__(self, scene: Scene, particles: Particles, beta: float) -> None:
+    def __init__(
+        self, scene: Scene, particles: Particles, beta: float, subpixel: bool = False
+    ) -> None:
         self.beta = number("DesignChain", "beta", beta, above=0.0, error=DesignError)
         self.threshold = 0.5
         self.filter = filter_matrix(scene, particles)
+        self.differences = lattice_differences(scene, particles) if subpixel else []
+        self.from_own: NDArray[np.int64] | None = None
         self.designed = particles.designed
         self.solids = solids(scene, particles)
         self._last: Field | None = None
@@ -177,7 +162,7 @@ class DesignChain:
         other = copy.copy(self)
         other.threshold, other._last = threshold, None
         if particles is not own:
-            other.filter = self.filter[nearest_designed(particles, own)]
+            other.from_own = nearest_designed(particles, own)
             other.designed = particles.designed
         other.solids = solids(scene, particles)
         return other
@@ -193,10 +178,30 @@ class DesignChain:
         filtered = self.filter @ phi
         filtered = filtered - (filtered.real - np.clip(filtered.real, -1.0, 1.0))  # rounding
         gamma = np.ones(self.designed.size, dtype=np.result_type(phi, float))
-        gamma[self.designed] = project(filtered, self.beta, self.threshold)
+        gamma[self.designed] = self._projected(filtered)
         material = interpolate(self.solids, gamma)
         self._last = Field(self, phi, filtered, gamma[self.designed], *material)
         return self._last
+
+    def _projected(self, filtered: NDArray) -> NDArray:
+        """gamma of the design particles."""
+        if self.differences:
+            gamma = project_subpixel(filtered, self.beta, self.threshold, self.differences)
+        else:
+            gamma = project(filtered, self.beta, self.threshold)
+        return gamma if self.from_own is None else gamma[self.from_own]
+
+    def _projected_adjoint(self, filtered: NDArray, gamma_bar: NDArray) -> NDArray:
+        """Adjoint of the filtered design."""
+        if self.from_own is not None:
+            own_bar = np.zeros(filtered.shape, gamma_bar.dtype)
+            np.add.at(own_bar, self.from_own, gamma_bar)
+            gamma_bar = own_bar
+        if self.differences:
+            return project_subpixel_adjoint(
+                filtered, self.beta, gamma_bar, self.threshold, self.differences
+            )
+        return project_adjoint(filtered, self.beta, gamma_bar, self.threshold)
 
 
 @dataclass(frozen=True)
@@ -209,7 +214,7 @@ class Field:
     phi : (D,) array
         Design variables.
     filtered : (D,) array
-        Filtered phi.
+        Filtered phi; of the chain's own design particles where it goes to another scene's.
     gamma : (D,) array
         Material density of the design particles, within [0, 1].
     density, stiffness : (N,) arrays
@@ -233,8 +238,7 @@ class Field:
         chain = self.chain
         through = interpolate_adjoint(chain.solids, density_bar, stiffness_bar)
         gamma_bar = through[chain.designed] + gamma_bar
-        phi_bar = project_adjoint(self.filtered, chain.beta, gamma_bar, chain.threshold)
-        return chain.filter.T @ phi_bar
+        return chain.filter.T @ chain._projected_adjoint(self.filtered, gamma_bar)
 
 
 def interpolate(material: Material | Solids, gamma: NDArray) -> tuple[NDArray, NDArray]:

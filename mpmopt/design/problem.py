@@ -56,6 +56,9 @@ class Problem:
         Of the simulation (`Simulation`).
     task : Task, optional
         Objective, constraints and scenes; default: the displacement in this one.
+    subpixel : bool, optional
+        Whether edges of the design are as wide as a particle, whatever beta is
+        (`projection.project_subpixel`).
 
     Attributes
     ----------
@@ -83,6 +86,7 @@ class Problem:
         limits: Indicators | None = LIMITS,
         precision: Precision = "double",
         task: Task = DEFAULT_TASK,
+        subpixel: bool = False,
     ) -> None:
         instance("Problem", "scene", scene, Scene)
         instance("Problem", "task", task, Task)
@@ -100,7 +104,7 @@ class Problem:
             instance("Problem", "limits", limits, Indicators)
         self.limits = limits
         self.particles = discretise(scene)
-        self.chain = DesignChain(scene, self.particles, beta)
+        self.chain = DesignChain(scene, self.particles, beta, subpixel)
         self.size = int(self.particles.designed.sum()) + sum(sizes(scene))
         self.members = tuple(self._member(variation) for variation in task.scenes)
 

@@ -54,9 +54,20 @@ def interruptible() -> Iterator[None]:
 
     complain = sys.unraisablehook
 
+    again: list[threading.Timer] = []
+
     def swallowed(what: sys.UnraisableHookArgs) -> None:
         if not isinstance(what.exc_value, Interrupted):
             complain(what)
+            return
+        # Raised in a library's callback, where nothing can be; a moment later it can.
+        for each in SIGNALS:
+            signal.signal(each, raise_it)
+        main = threading.main_thread().ident
+        timer = threading.Timer(0.1, signal.pthread_kill, (main, heard[-1]))
+        timer.daemon = True
+        timer.start()
+        again.append(timer)
 
     sys.unraisablehook = swallowed
     handlers = {number: signal.signal(number, raise_it) for number in SIGNALS}
@@ -68,6 +79,8 @@ def interruptible() -> Iterator[None]:
             raise Interrupted(heard[0]) from error
         raise
     finally:
+        for timer in again:
+            timer.cancel()
         sys.unraisablehook = complain
         for number, handler in handlers.items():
             signal.signal(number, handler)

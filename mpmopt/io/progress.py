@@ -1,4 +1,7 @@
-"""How far a long command is: a bar on a terminal, lines elsewhere; both on standard error."""
+"""How far a long command is: a bar on a terminal or below a cell, lines elsewhere.
+
+Bars of a terminal and lines are on standard error.
+"""
 
 from __future__ import annotations
 
@@ -10,17 +13,18 @@ from contextlib import ExitStack, redirect_stderr
 from typing import Any, TextIO
 
 from tqdm import tqdm
-from tqdm.contrib import DummyTqdmFile
 
 from mpmopt.io.console import say
+from mpmopt.io.notebook import Line, in_notebook
 
 LINES = 10  # of a work whose size is known; of another, one in so many steps
 
 
 class Progress:
-    """A bar that shows steps of work; off a terminal, a line now and then.
+    """A bar that shows steps of work; off terminals and notebooks, a line now and then.
 
-    While there is a bar, log lines and what else goes to standard error are written above it.
+    While there is a bar on a terminal, log lines and what else goes to standard error are written
+    above it.
 
     Parameters
     ----------
@@ -41,13 +45,21 @@ class Progress:
         self._unit, self.total, self.count = unit, total, 0
         self._every = max(1, total // LINES) if total else LINES
         self._began = time.monotonic()
-        self._stream = sys.stderr
-        shown = self._stream is not None and self._stream.isatty()
+        below_cell = in_notebook()
+        stream: Any = Line() if below_cell else sys.stderr
+        terminal = not below_cell and stream is not None and stream.isatty()
+        self._stream = stream
         self._bar = tqdm(
-            total=total, unit=f" {unit}", disable=not shown, leave=False, file=self._stream
+            total=total,
+            unit=f" {unit}",
+            disable=not (below_cell or terminal),
+            leave=below_cell,
+            file=self._stream,
+            mininterval=1.0 if below_cell else 0.1,
+            ncols=120 if below_cell else None,
         )
         undo = ExitStack()
-        if shown:
+        if terminal:
             _write_above(self._stream, undo)
         undo.callback(self._bar.close)
         self._end = weakref.finalize(self, undo.close)  # also after an error
@@ -73,7 +85,7 @@ class Progress:
             say(f"{line}: {text}" if text else line)
 
     def close(self) -> None:
-        """Remove the bar."""
+        """Remove the bar from a terminal; below a cell it stays as it is."""
         self._end()
 
     def print(self, line: str) -> None:
@@ -84,6 +96,8 @@ class Progress:
 
 def _write_above(terminal: TextIO, undo: ExitStack) -> None:
     """Let whole lines on standard error, those of loggers too, stand above all bars."""
+    from tqdm.contrib import DummyTqdmFile  # in a notebook the import warns of missing widgets
+
     stream: Any = DummyTqdmFile(terminal)
     for logger in (logging.getLogger(), logging.getLogger("mpmopt")):
         for handler in logger.handlers:

@@ -44,13 +44,11 @@ OPTIONS: dict[str, Any] = {
     "fastmath": {"contract", "reassoc", "nsz", "arcp"},
 }
 
-# Without the counting of references to arrays, and for compiled callers alone.
-BARE: dict[str, Any] = {
-    **OPTIONS,
-    "_nrt": False,
-    "no_cpython_wrapper": True,
-    "no_cfunc_wrapper": True,
-}
+# For compiled callers alone: no function that unpacks Python's objects is compiled beside it.
+INNER: dict[str, Any] = {**OPTIONS, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+
+# And without the counting of references to arrays.
+BARE: dict[str, Any] = {**INNER, "_nrt": False}
 
 
 def loop_jit(function: Callable[..., Any]) -> Any:
@@ -67,11 +65,21 @@ def jit(function: Callable[..., Any]) -> Any:
     return _stamped(njit(**OPTIONS, forceinline=True)(function))
 
 
+def inner_jit(function: Callable[..., Any]) -> Any:
+    """As `jit`, for kernels that only compiled code calls: tuples of arrays are long to unpack."""
+    return _stamped(njit(**INNER, forceinline=True)(function))
+
+
+def inner_loop_jit(function: Callable[..., Any]) -> Any:
+    """As `inner_jit`, of a loop that stands by itself."""
+    return _stamped(njit(**INNER)(function))
+
+
 def bare_jit(function: Callable[..., Any]) -> Any:
     """As `jit`, for kernels that make no arrays: they count no references to those they take.
 
     Counting costs more than a short kernel does whose tuples hold many arrays. Only compiled code
-    calls them.
+    calls them. They return no arrays: the caller would free what was never counted.
     """
     return _stamped(njit(**BARE, forceinline=True)(function))
 

@@ -18,7 +18,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from mpmopt.kernels.actuation import second_piola
 from mpmopt.kernels.arrays import DEFORMATION, POSITION, STATE_SIZE, VELOCITY
-from mpmopt.kernels.compiler import bare_jit, bare_loop_jit, jit, loop_jit
+from mpmopt.kernels.compiler import bare_jit, bare_loop_jit, inner_jit, loop_jit
 from mpmopt.kernels.ground import (
     CREEPING,
     DAMPING,
@@ -82,13 +82,13 @@ class Lattice(NamedTuple):
     active: NDArray[np.bool_]  # (V,) whether a record has actuated particles
     actuation_stress: NDArray[np.float64]  # (K, 3) second Piola-Kirchhoff S: xx, xy, yy
     mass: NDArray  # (M,) of the nodes, lumped
-    touch: Any  # `kernels.pairs.Touch`
     held: NDArray[np.int64]  # (H,) nodes that clamps hold
     holder: NDArray[np.int64]  # (H,) which clamp each of them is in
     clamps: NDArray[np.float64]  # (steps, K, 6) as those of `kernels.arrays.Parameters`
     ground: Any  # `kernels.ground.Ground`
     nodes_y: int  # of the grid that the ground's table is for, and how many along x
     nodes_x: int
+    touch: Any  # `kernels.pairs.Touch`; the last one: see `but_touch`
 
 
 class LatticeBar(NamedTuple):
@@ -113,13 +113,19 @@ class Rows(NamedTuple):
     stress: NDArray  # (fields, 2, n, MARGIN + width) by x and y, of particles by place along x
 
 
+@inner_jit
+def but_touch(lattice):
+    """A lattice without its last field: most kernels do not ask for it, and compile faster."""
+    return Lattice(*lattice[:-1], 0)
+
+
 @bare_jit
 def width_of(lattice):
     """Numbers in a row of nodes: the last group's cells touch two nodes beyond it."""
     return 4 * lattice.groups + 4
 
 
-@jit
+@inner_jit
 def make_rows(fields, stressed, lattice):
     """Room for a row of so many fields, and so many components that have stresses."""
     n, width, dtype = len(lattice.weights), width_of(lattice), lattice.stiffness.dtype
@@ -334,7 +340,8 @@ def particles(nodes: NDArray, lattice: Any, number: NDArray[np.int64], state: ND
     `number` (V, 4) tells which particle of `state`, records (12 G, 4) of groups of four, each of
     the lattice's is; -1: none.
     """
-    to_particles(nodes, lattice, number, make_rows(4, 0, lattice), state)
+    lattice = but_touch(lattice)
+    to_particles(nodes, lattice, number, make_rows(4, 3, lattice), state)
 
 
 @bare_loop_jit
@@ -469,7 +476,10 @@ def find_near(state, lattice, rows, near):
 @bare_jit
 def is_near(near, j, lattice):
     """Whether a layer is near to a row of cells."""
-    return np.any(near[j * lattice.groups : (j + 1) * lattice.groups])
+    found = False
+    for g in range(j * lattice.groups, (j + 1) * lattice.groups):
+        found = found or near[g]
+    return found
 
 
 @bare_loop_jit
@@ -586,7 +596,7 @@ def fold(fields, lattice):
             fields[field, inner], fields[field, outer] = folded, sign * folded
 
 
-@jit
+@inner_jit
 def steps_per_mass(lattice):
     """dt / m of the nodes (M,), and zero where they have no mass, or forces cannot move them."""
     per_mass = np.zeros_like(lattice.mass)
@@ -725,9 +735,10 @@ def advance_lattice(
 
     Returns the step reached, and a node whose velocity is not a number then, or -1.
     """
+    touch, lattice = lattice.touch, but_touch(lattice)
     rows, force = make_rows(4, 3, lattice), np.zeros((3, len(lattice.mass)), states.dtype)
     near, per_mass = np.zeros(len(lattice.filled), np.bool_), steps_per_mass(lattice)
-    moved, touching, room = math.inf, nowhere(lattice.touch), -1.0
+    moved, touching, room = math.inf, nowhere(touch), -1.0
     for n in range(first, last):
         old, new = states[n % len(states)], states[(n + 1) % len(states)]
         force[:] = 0.0
@@ -738,9 +749,9 @@ def advance_lattice(
                 moved = 0.0
             press(old, lattice, near, rows, force)
         if room < 0.0:
-            touching, room = renewed(touching, old, lattice.touch)
+            touching, room = renewed(touching, old, touch)
         if len(touching.pairs):
-            push_apart(touching, old, lattice.touch, force)
+            push_apart(touching, old, touch, force)
         if lattice.mirror_axis >= 0:
             fold(force, lattice)
         speed = move(old, new, force, per_mass, lattice)
@@ -776,10 +787,11 @@ def advance_lattice_adjoint(
 
     `state_bar` (4, M) is overwritten; `bar` and `signal_bar` (steps, K) are added to.
     """
+    touch, lattice = lattice.touch, but_touch(lattice)
     rows, force = make_rows(6, 4, lattice), np.zeros((3, len(lattice.mass)), states.dtype)
     force_bar = np.zeros_like(force)
     near, per_mass = np.zeros(len(lattice.filled), np.bool_), steps_per_mass(lattice)
-    moved, touching, room = math.inf, nowhere(lattice.touch), -1.0
+    moved, touching, room = math.inf, nowhere(touch), -1.0
     for n in range(last - 1, first - 1, -1):
         old, new = states[n], states[n + 1]
         if len(lattice.ground.layers):
@@ -796,9 +808,9 @@ def advance_lattice_adjoint(
         if lattice.mirror_axis >= 0:
             fold(force_bar, lattice)
         if room < 0.0:
-            touching, room = renewed(touching, old, lattice.touch)
+            touching, room = renewed(touching, old, touch)
         if len(touching.pairs):
-            push_apart_adjoint(touching, old, lattice.touch, force_bar, state_bar, bar.grip)
+            push_apart_adjoint(touching, old, touch, force_bar, state_bar, bar.grip)
         step = lattice.dt * fastest_of(old)
         moved += step
         room -= step

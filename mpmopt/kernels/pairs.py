@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mpmopt.kernels.compiler import jit, loop_jit
+from mpmopt.kernels.compiler import bare_jit, inner_jit, inner_loop_jit, loop_jit
 from mpmopt.kernels.overlap import FAR
 
 # Distance d_c below which two particles push each other, in cells.
@@ -26,7 +26,7 @@ HALF = 0.499
 # Cells of a block along each axis. Neighbours by an edge hold nothing that was far apart.
 SIDE = 2
 # Where nodes are that were nowhere yet.
-NOWHERE = 1e150
+NOWHERE = math.inf
 # gamma_0, the share of the solid's stiffness below which a particle pushes nothing.
 LEAST_STIFFNESS = 0.05
 
@@ -65,7 +65,7 @@ class Near(NamedTuple):
     room: float  # by how much others of these cells' pairs must come nearer to touch
 
 
-@jit
+@bare_jit
 def position(nodes, touch, cell, k):
     """Of particle k of a cell, from the first two rows of numbers of the nodes."""
     first = touch.first[cell]
@@ -77,7 +77,7 @@ def position(nodes, touch, cell, k):
     return x, y
 
 
-@jit
+@bare_jit
 def site(touch, cell, k):
     """Of a particle or an image on the lattice of particles in the reference configuration."""
     i, j, n = k // touch.per_cell, k % touch.per_cell, touch.per_cell
@@ -86,28 +86,41 @@ def site(touch, cell, k):
     return n * touch.corner[cell, 0] + i, n * touch.corner[cell, 1] + j
 
 
-@jit
+@bare_jit
 def imaged(x, y, touch):
     """Position of an image."""
     return (2.0 * touch.plane - x, y) if touch.axis == 0 else (x, 2.0 * touch.plane - y)
 
 
-@jit
+@bare_jit
 def flipped(x, y, touch):
     """Direction of an image."""
     return (-x, y) if touch.axis == 0 else (x, -y)
 
 
-@jit
+@bare_jit
 def strayed(nodes, at, touch):
-    """How far the farthest node of what may touch is from where it was."""
-    most = 0.0
+    """By how much at most two of what may touch came nearer than they were, halved.
+
+    Which is half the diagonal of the box of their displacements: what all share brings none nearer.
+    Along a mirror plane's normal an image goes the other way.
+    """
+    if at[0, 0] == NOWHERE:
+        return math.inf
+    low_x = low_y = math.inf
+    high_x = high_y = -math.inf
     for i in range(at.shape[1]):
-        dx, dy = nodes[0, i].real - at[0, i], nodes[1, i].real - at[1, i]
-        square = touch.nodes[i] * (dx * dx + dy * dy)
-        if square > most:
-            most = square
-    return math.sqrt(most)
+        if touch.nodes[i] > 0.0:
+            dx, dy = nodes[0, i].real - at[0, i], nodes[1, i].real - at[1, i]
+            low_x, high_x = min(low_x, dx), max(high_x, dx)
+            low_y, high_y = min(low_y, dy), max(high_y, dy)
+    if high_x < low_x:
+        return 0.0  # nothing may touch anything
+    if touch.axis == 0:
+        low_x, high_x = min(low_x, -high_x), max(high_x, -low_x)
+    elif touch.axis == 1:
+        low_y, high_y = min(low_y, -high_y), max(high_y, -low_y)
+    return 0.5 * math.hypot(high_x - low_x, high_y - low_y)
 
 
 @loop_jit
@@ -124,7 +137,7 @@ def nowhere(touch: Any) -> Near:
     )
 
 
-@loop_jit
+@inner_loop_jit
 def look_for_cells(nodes, touch):
     """Pairs of cells whose particles may come to touch: own cells, and own ones with images.
 
@@ -160,20 +173,49 @@ def look_for_cells(nodes, touch):
                 m = newest[a * rows + b]
                 while m >= 0 and n < own:
                     if are_far_and_near(blocks, n, m, rim + SIDE - 1, reach):
-                        while total + SIDE**4 > len(found):
-                            found = np.concatenate((found, found))
+                        if total + SIDE**4 > len(found):
+                            found = grown(found)
                         total = add_cells(found, total, which[n], which[m], cells, touch, reach)
                     m = older[m]
         older[n] = newest[i * rows + j]
         newest[i * rows + j] = n
-    keys = np.sort(found[:total])
+    sort(found, total)
+    return unpacked(found, total, 2 * count)
+
+
+@inner_jit
+def grown(keys):
+    """The same with room for twice as many."""
+    more = np.empty(2 * len(keys), np.int64)
+    for n in range(len(keys)):
+        more[n] = keys[n]
+    return more
+
+
+@bare_jit
+def sort(keys, total):
+    """Put so many keys in ascending order (Shell 1959)."""
+    gap = total // 2
+    while gap > 0:
+        for n in range(gap, total):
+            key, m = keys[n], n
+            while m >= gap and keys[m - gap] > key:
+                keys[m] = keys[m - gap]
+                m -= gap
+            keys[m] = key
+        gap //= 2
+
+
+@inner_jit
+def unpacked(keys, total, base):
+    """The pairs (total, 2) a, b of keys a base + b."""
     pairs = np.empty((total, 2), np.int64)
     for n in range(total):
-        pairs[n, 0], pairs[n, 1] = keys[n] // (2 * count), keys[n] % (2 * count)
+        pairs[n, 0], pairs[n, 1] = keys[n] // base, keys[n] % base
     return pairs
 
 
-@loop_jit
+@inner_loop_jit
 def boxes_of_cells(nodes, touch):
     """Boxes (2 C, 6) about the particles of cells and images, and their places on the lattice.
 
@@ -208,7 +250,7 @@ def boxes_of_cells(nodes, touch):
     return boxes
 
 
-@jit
+@bare_jit
 def add_image(boxes, n, m, touch):
     """Makes box m that of the image of box n."""
     x0, y0 = imaged(boxes[n, 0], boxes[n, 1], touch)
@@ -217,7 +259,7 @@ def add_image(boxes, n, m, touch):
     boxes[m, 1], boxes[m, 3] = min(y0, y1), max(y0, y1)
 
 
-@loop_jit
+@inner_loop_jit
 def boxes_of_blocks(cells, touch, reach):
     """The same of blocks, and of those images that may be near to any; which, and their number."""
     own = len(touch.blocks)
@@ -246,7 +288,7 @@ def boxes_of_blocks(cells, touch, reach):
     return boxes, which, units
 
 
-@jit
+@bare_jit
 def are_far_and_near(boxes, n, m, rim, reach):
     """Whether two boxes are nearer than `reach`, and were farther apart than what is one part.
 
@@ -258,7 +300,7 @@ def are_far_and_near(boxes, n, m, rim, reach):
     return i * i + j * j > FAR * FAR and x * x + y * y < reach * reach
 
 
-@jit
+@bare_jit
 def add_cells(found, total, n, m, boxes, touch, reach):
     """Adds keys of near cells of block n and of block or image m; returns how many there are."""
     count, own = len(touch.grip), len(touch.blocks)
@@ -276,7 +318,7 @@ def add_cells(found, total, n, m, boxes, touch, reach):
     return total
 
 
-@loop_jit
+@inner_loop_jit
 def look_for_particles(nodes, touch, cells):
     """Pairs of particles of near cells that may come to touch, and the cells that they are of.
 
@@ -284,7 +326,7 @@ def look_for_particles(nodes, touch, cells):
     """
     count, size = touch.grip.shape
     reach, far = (REACH + SKIN) * touch.dx, (FAR * touch.per_cell) ** 2
-    found, total, others = np.empty((64, 2), np.int64), 0, math.inf
+    found, total, others = np.empty(64, np.int64), 0, math.inf
     there = np.zeros(count, np.bool_)
     place, last = np.empty((2, size, 2)), -1
     for n in range(len(cells)):
@@ -311,15 +353,21 @@ def look_for_particles(nodes, touch, cells):
                             others = square
                             continue
                         if total == len(found):
-                            found = np.concatenate((found, found))
-                        found[total, 0], found[total, 1] = a * size + k, b * size + m
+                            found = grown(found)
+                        found[total] = (a * size + k) * 2 * count * size + b * size + m
                         total += 1
                         there[a] = there[own] = True
     room = math.sqrt(others) - REACH * touch.dx
-    return found[:total].copy(), np.nonzero(there)[0], room
+    members, own = np.empty(count, np.int64), 0
+    for c in range(count):
+        if there[c]:
+            members[own] = c
+            own += 1
+    members = members[:own]
+    return unpacked(found, total, 2 * count * size), members, room
 
 
-@jit
+@inner_jit
 def places(nodes):
     """Real parts (2, M) of the nodes' positions."""
     at = np.empty((2, nodes.shape[1]))
@@ -339,7 +387,8 @@ def renewed(near: Any, nodes: NDArray, touch: Any) -> tuple[Near, float]:
         at, old, moved = places(nodes), nowhere(touch), 0.0
         cells = look_for_cells(at, touch)
         if len(cells) == 0:
-            touch.alone[:] = at
+            for i in range(at.shape[1]):
+                touch.alone[0, i], touch.alone[1, i] = at[0, i], at[1, i]
         near = Near(at, cells, old.at, old.pairs, old.members, old.room)
     room = may - moved
     if len(near.cells) > 0:
@@ -352,7 +401,7 @@ def renewed(near: Any, nodes: NDArray, touch: Any) -> tuple[Near, float]:
     return near, room
 
 
-@jit
+@bare_jit
 def way_between(pairs, n, place, touch):
     """The particles of a pair, whether the second is there as its image, and the way from there."""
     a, b = pairs[n, 0], pairs[n, 1] % touch.grip.size
@@ -389,7 +438,7 @@ def push_apart(near: Any, nodes: NDArray, touch: Any, force: NDArray) -> None:
     spread(near, touch, pushes, force)
 
 
-@jit
+@bare_jit
 def spread(near, touch, numbers, nodes):
     """Adds numbers (., 2) of particles to those of the nodes: the transpose of `position`."""
     size = touch.grip.shape[1]

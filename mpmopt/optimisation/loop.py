@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
@@ -15,11 +16,11 @@ from mpmopt.assess.threshold import post_processed
 from mpmopt.design.chain import non_discreteness
 from mpmopt.design.problem import Problem
 from mpmopt.design.task import DEFAULT_TASK, FEASIBLE, Task
-from mpmopt.design.variables import Freedom, completed
+from mpmopt.design.variables import START, Freedom, completed
 from mpmopt.errors import DesignError, SceneError, SimulationError
 from mpmopt.optimisation.history import Candidate, Iteration, Optimisation, StageState
 from mpmopt.optimisation.mma import MovingAsymptotes
-from mpmopt.optimisation.settings import Settings
+from mpmopt.optimisation.settings import DEFAULT_SETTINGS, Settings
 from mpmopt.scene import Scene
 from mpmopt.simulation.checkpoints import Checkpointing
 from mpmopt.simulation.indicators import Indicators
@@ -34,18 +35,20 @@ HALVINGS = 3
 
 
 Callback = Callable[[Optimisation], None]
-HOW = "write Settings(stages), or call what makes them, such as continuation(time_step)"
+HOW = "write Settings(most_iterations=25), or call what makes them, such as continuation()"
 
 
 def optimise(
     scene: Scene,
-    settings: Settings,
-    start: NDArray[np.float64] | Sequence[float] | Mapping[str, Any],
+    settings: Settings = DEFAULT_SETTINGS,
+    start: NDArray[np.float64] | Sequence[float] | Mapping[str, Any] = START,
     callbacks: Iterable[Callback] | Callback = (),
     checkpointing: Checkpointing | None = None,
     task: Task = DEFAULT_TASK,
 ) -> Optimisation:
     """Maximise a task's objective subject to its constraints, stage by stage.
+
+    In a notebook a bar shows how far it is, and a picture below it the best design so far.
 
     An evaluation that fails steps back to the stage's incumbent and halves the move limit, which
     then recovers slowly. A stage of which no design ran yet takes the best of the one before, and
@@ -55,8 +58,9 @@ def optimise(
     Parameters
     ----------
     scene : Scene
-    settings : Settings
-    start : mapping or (n,) array
+    settings : Settings, optional
+        Default: up to 200 iterations of each of `settings.STAGES`.
+    start : mapping or (n,) array, optional
         First design, within [-1, 1]: what `Problem.join` takes, by name, such as
         ``{"phi": picture}``, the rest as in `variables.START`; or the vector that it makes for the
         first stage's scene.
@@ -170,6 +174,10 @@ def go_on(
         )
     if run.stop_reason:
         return run
+    if "ipykernel" in sys.modules:  # in a notebook
+        from mpmopt.view.live import watched
+
+        all_callbacks = watched(all_callbacks)
     began = time.monotonic() - (run.history[-1].seconds if run.history else 0.0)
 
     def report() -> None:
@@ -242,6 +250,7 @@ class _Ascent:
             self.freedom.upper,
             move_limit=self.stage.move_limit,
             asymptote_initial=0.5 / (self.stage.beta + 1.0) if settings.sharpen_asymptotes else 0.5,
+            asymptote_min=settings.asymptote_min,
         )
         self.values: list[float] = []
         self.failures = 0

@@ -12,7 +12,7 @@ from mpmopt.optimisation.settings import Settings, Stage
 IN_ONE_PIECE = Task(subject_to=(AtMost(OnePiece(), math.log(4.0)),))
 
 
-def continuation(time_step: float, most_iterations: int = 25) -> Settings:
+def continuation(time_step: float | None = None, most_iterations: int = 25) -> Settings:
     """Beta from 0.5 to 32; void weighs 1e-2 of a solid, until what is clear void is left out.
 
     From 8 on, that is, when designs are judged solid too, with the least of their refinement study.
@@ -35,17 +35,18 @@ def continuation(time_step: float, most_iterations: int = 25) -> Settings:
 
 
 def gait(time_step: float, most_iterations: int) -> Settings:
-    """One stage of plain moving asymptotes at beta = 8, where distance is smooth.
+    """One stage of plain moving asymptotes with short moves, black and white from the first design.
 
-    That is so with contact layers, finite friction and viscosity, in the total Lagrangian
-    formulation, whose void may be light. What grey bodies gain is lost when they are made black
-    and white, and a gait that is tuned is lost when beta rises: so it begins sharp, stays so, and
-    counts every design without grey. The best is at least as good as a start that is a drawing.
+    Its edges are as wide as a particle, so that no grey is there whose gain could be lost. Every
+    design counts without it all the same, so the best is at least as good as the start, which is a
+    drawing that strides. That needs contact layers, finite friction and viscosity, where distance
+    is smooth, and the total Lagrangian formulation, whose void may be light.
     """
     return Settings(
-        (Stage(8.0, 2e-3, 2e-4, time_step, solid=True, move_limit=0.05),),
+        (Stage(100.0, 2e-3, 2e-4, time_step, solid=True, move_limit=0.02, subpixel=True),),
         adapt_move_limit=False,
         sharpen_asymptotes=False,
+        asymptote_min=0.01,
         tolerance=0.0,
         most_iterations=most_iterations,
     )

@@ -12,11 +12,15 @@ from mpmopt.design.step_control import LIMITS
 from mpmopt.design.task import DEFAULT_TASK, Task
 from mpmopt.errors import DesignError
 from mpmopt.scene import Scene
+from mpmopt.scene.scene import Formulation
 from mpmopt.simulation.checkpoints import Checkpointing
 from mpmopt.validation import count, flag, number, share, shown
 
 # Successful evaluations of a stage before the stop rule may end it.
 LEAST = 20
+# Density and stiffness of void, over those of solid. In the updated formulation void is torn and
+# flung when it is lighter; in the total Lagrangian it may be light.
+FLOORS: Mapping[Formulation, tuple[float, float]] = {"updated": (1e-2, 1e-3), "total": (2e-3, 2e-4)}
 
 
 def _take(owner: Any, check: Callable[..., Any], names: str, **limits: float) -> None:
@@ -36,9 +40,10 @@ class Stage:
     ----------
     beta : float
         Sharpness of the projection.
-    void_density, void_stiffness : float
-        Share of mass and stiffness that void keeps.
-    time_step : float
+    void_density, void_stiffness : float, optional
+        Share of mass and stiffness that void keeps; default: `FLOORS` of the scene's formulation.
+    time_step : float, optional
+        Default: the scene's.
     solid : bool
         Whether the best design is the one that goes farthest once its void is removed
         (`threshold.post_processed`), which costs a forward run more, instead of as it is. The
@@ -58,6 +63,9 @@ class Stage:
     limited : bool
         Whether an evaluation that goes beyond `step_control.LIMITS` is rejected too, or only one
         that fails.
+    subpixel : bool
+        Whether edges of the design are as wide as a particle, and the rest is black and white,
+        whatever beta is (`projection.project_subpixel`).
 
     Raises
     ------
@@ -66,9 +74,9 @@ class Stage:
     """
 
     beta: float
-    void_density: float
-    void_stiffness: float
-    time_step: float
+    void_density: float | None = None
+    void_stiffness: float | None = None
+    time_step: float | None = None
     solid: bool = False
     refined: bool = False
     move_limit: float = 0.05
@@ -76,14 +84,16 @@ class Stage:
     most_iterations: int | None = None
     halvings: int = 2
     limited: bool = True
+    subpixel: bool = False
 
     def __post_init__(self) -> None:
         _take(self, number, "beta void_density void_stiffness time_step move_limit", above=0.0)
         for name in ("void_density", "void_stiffness", "move_limit"):
-            if getattr(self, name) > 1.0:
-                raise DesignError(f"Stage: {name} = {getattr(self, name)} must be at most 1")
+            value = getattr(self, name)
+            if value is not None and value > 1.0:
+                raise DesignError(f"Stage: {name} = {value} must be at most 1")
         _take(self, share, "void_cutoff")
-        _take(self, flag, "solid refined limited")
+        _take(self, flag, "solid refined limited subpixel")
         if self.refined and not self.solid:
             raise DesignError("Stage: refined = True needs solid = True")
         _take(self, count, "most_iterations", least=1)
@@ -91,10 +101,11 @@ class Stage:
 
     def scene(self, scene: Scene) -> Scene:
         """The scene as this stage simulates it."""
+        density, stiffness = FLOORS[scene.formulation]
         return scene.vary(
             time_step=self.time_step,
-            void_density=self.void_density,
-            void_stiffness=self.void_stiffness,
+            void_density=density if self.void_density is None else self.void_density,
+            void_stiffness=stiffness if self.void_stiffness is None else self.void_stiffness,
         )
 
     def problem(
@@ -114,7 +125,12 @@ class Stage:
             self.halvings,
             LIMITS if self.limited else None,
             task=task,
+            subpixel=self.subpixel,
         )
+
+
+# A short continuation for any scene; the last stage counts designs without their void.
+STAGES = (Stage(1.0), Stage(4.0), Stage(16.0, solid=True))
 
 
 @dataclass(frozen=True)
@@ -123,13 +139,16 @@ class Settings:
 
     Attributes
     ----------
-    stages : tuple of Stage
-        Or a single one.
+    stages : tuple of Stage, optional
+        Or a single one; default: `STAGES`.
     adapt_move_limit : bool
         Shorten the move limit after a step that went back, and lengthen it, up to the stage's,
         after one that went on.
     sharpen_asymptotes : bool
         Initial asymptotes at 0.5 / (beta + 1) of the range instead of 0.5.
+    asymptote_min : float
+        Least distance of an asymptote, as a fraction of the range. Svanberg's is 0.01: moves of a
+        design whose gradient changes its sign do not die out then, and do not converge either.
     best_first : bool
         Start each stage from the design of the one before that went farthest, instead of its last.
     window : int
@@ -151,9 +170,10 @@ class Settings:
         If there is no stage or a number makes no sense.
     """
 
-    stages: tuple[Stage, ...]
+    stages: tuple[Stage, ...] = STAGES
     adapt_move_limit: bool = True
     sharpen_asymptotes: bool = True
+    asymptote_min: float = 1e-6
     best_first: bool = True
     window: int = 10
     tolerance: float = 2e-4
@@ -170,6 +190,7 @@ class Settings:
         _take(self, flag, "adapt_move_limit sharpen_asymptotes best_first")
         _take(self, count, "window least_iterations most_iterations most_failures", least=1)
         _take(self, number, "tolerance")
+        _take(self, number, "asymptote_min", above=0.0)
         if self.least > self.most_iterations:
             raise DesignError(
                 f"Settings: least_iterations = {self.least_iterations} is above "
@@ -188,3 +209,6 @@ class Settings:
     def from_dict(cls, values: Mapping[str, Any]) -> Settings:
         """The settings of which `dataclasses.asdict` makes these values."""
         return cls(**{**values, "stages": tuple(Stage(**stage) for stage in values["stages"])})
+
+
+DEFAULT_SETTINGS = Settings()

@@ -2,8 +2,8 @@
 
 Layout (version 6)::
 
-    attributes       format, version, stage, reason, gave_up, stop_reason; as JSON: scene,
-                     settings, task, versions, summary
+    attributes       format, version, stage, reason, gave_up, stop_reason, full_study; as JSON:
+                     scene, settings, task, versions, summary
     x                the design that the stage began with
     history/NAME     one entry per evaluation: objective, beta, non_discreteness, step, ...
     designs          one row per evaluation: 255 gamma, rounded, for pictures; may be missing
@@ -65,12 +65,15 @@ class RunFile:
         That of `summary.summarise`; empty if there is none yet.
     baseline : (D,) array of bool, optional
         Which design particles the baseline design has, if there is one.
+    full_study : bool, optional
+        Whether the finished robot is to be tried in all ways of `robustness.study`.
     """
 
     run: Optimisation
     versions: dict[str, str]
     summary: dict[str, Any] = field(default_factory=dict)
     baseline: NDArray[np.bool_] | None = field(default=None, repr=False)
+    full_study: bool = False
 
 
 def write(
@@ -78,6 +81,7 @@ def write(
     run: Optimisation,
     summary: Mapping[str, Any] | None = None,
     baseline: NDArray[np.bool_] | None = None,
+    full_study: bool = False,
 ) -> None:
     """Write a run as it stands; an older file of that name is replaced only by a complete one.
 
@@ -88,6 +92,7 @@ def write(
     summary : mapping, optional
         Of a finished run.
     baseline : (D,) array of bool, optional
+    full_study : bool, optional
         As in `RunFile`.
 
     Raises
@@ -100,6 +105,7 @@ def write(
     with file_in_memory() as file:
         _fill(file, run)
         file.attrs["summary"] = json.dumps(dict(summary or {}))
+        file.attrs["full_study"] = bool(full_study)
         if baseline is not None:
             file.create_dataset("baseline", data=baseline, dtype="?")
         file.flush()
@@ -234,6 +240,7 @@ def _read(file: h5py.File, path: Path) -> RunFile:
         versions=json.loads(file.attrs["versions"]),
         summary=dict(json.loads(file.attrs["summary"])),
         baseline=_read_baseline(file["baseline"]) if "baseline" in file else None,
+        full_study=bool(file.attrs.get("full_study", False)),  # a later addition
     )
 
 

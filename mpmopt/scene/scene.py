@@ -312,6 +312,12 @@ class Scene(Checked):
         return max(1, math.floor(passes + 0.5 + ROUNDING))
 
     @property
+    def filter_spread(self) -> float:
+        """Standard deviation of the filter: `filter_length`, but for whole passes."""
+        _, w1, w2 = self.filter_weights
+        return self.grid.dx * math.sqrt(0.5 + 2.0 * self.filter_passes * (w1 + 2.0 * w2))
+
+    @property
     def filter_radius(self) -> float:
         """Distance, in cells, beyond which the filter takes no notice of a particle.
 

@@ -95,6 +95,12 @@ def wanted_steps(instants: Collection[int], steps: int) -> set[int]:
     return {int(step) for step in (*instants, steps)}
 
 
+def looked_at(first: int, last: int, steps: int, every: int) -> list[int]:
+    """Slots of the states that are looked at after steps `first`, in slot 0, to `last`."""
+    slots = [*range(-first % every, last - first, every)]
+    return [*slots, last - first] if last == steps else slots
+
+
 class Watcher:
     """What is seen of a run: its indicators so far, and the states that were asked for."""
 
@@ -111,10 +117,7 @@ class Watcher:
             if first <= step <= last:
                 shape = self.simulation.initial.shape
                 self.states[step] = kernels.ungrouped(states[step - first], *shape)
-        slots = [*range(-first % WATCH, last - first, WATCH)]
-        if last == self.simulation.steps:
-            slots.append(last - first)
-        for slot in slots:
+        for slot in looked_at(first, last, self.simulation.steps, WATCH):
             self._seen = self._seen.join(self.simulation.indicators(states[slot]))
             if (first + slot) % LOOK == 0 or first + slot == self.simulation.steps:
                 gap = self.simulation.gap(states[slot])

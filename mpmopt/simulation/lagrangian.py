@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any
 
@@ -12,12 +11,12 @@ from numpy.typing import DTypeLike, NDArray
 
 from mpmopt import kernels
 from mpmopt.errors import DesignError, SimulationError
-from mpmopt.kernels import lagrangian, pairs
+from mpmopt.kernels import lagrangian, lattice_indicators, pairs
 from mpmopt.scene.parts import Vector
 from mpmopt.simulation.buffers import Memory
 from mpmopt.simulation.checkpoints import Checkpointing, Checkpoints, Schedule
 from mpmopt.simulation.energy import LOOK
-from mpmopt.simulation.indicators import Indicators, Watched, wanted_steps
+from mpmopt.simulation.indicators import Indicators, Watched, looked_at, wanted_steps
 from mpmopt.simulation.simulation import Forward, Gradient, Simulation, check_terminal_adjoints
 from mpmopt.simulation.surroundings import holders
 
@@ -299,45 +298,21 @@ class LagrangianSimulation(Simulation):
             states[0] = states[last - first]
         return Watched(watcher.states, watcher.seen)
 
-    def look(self, nodes: NDArray) -> Indicators:
-        """Indicators of a state of the nodes: Courant number, smallest J of solid, and gap.
+    def look(self, states: NDArray, slots: Sequence[int]) -> Indicators:
+        """Indicators of states of the nodes, slots of `states` (., 4, M).
 
-        Of the Courant number a particle alone in its cell bears 0.9; blocks bear more. Solid cannot
-        tear here, and no energy is counted.
+        Courant number, smallest J of solid, and gap. Of the Courant number a particle alone in its
+        cell bears 0.9; blocks bear more. Solid cannot tear here, and no energy is counted.
         """
-        records = self._records(nodes)
-        gap, gap_x, gap_y = self.gap(records)
-        F = records.real.reshape(-1, kernels.STATE_SIZE, 4)[:, 8:].swapaxes(0, 1)
-        F = F[:, self._solid]
-        courant, smallest = 0.0, math.inf
-        if F.size:
-            courant, smallest = self._courant(F), float((F[0] * F[3] - F[1] * F[2]).min())
-        return Indicators(courant, jacobian=smallest, gap=gap, gap_x=gap_x, gap_y=gap_y)
-
-    def _courant(self, F: NDArray) -> float:
-        """Largest Courant number k_v + sqrt(k_v^2 + k_e^2) of solid as stretched as it is.
-
-        Void, which is crushed and turned inside out, moves with the solid around it.
-
-        Against dF = a N, a wave along N, the tangent of `kernels.lagrangian.solid_stress` has the
-        stiffness M = mu + h' s^2 with h = (lambda ln J - mu) (ln J)' and the larger stretch s; its
-        viscosity is eta s^2. k_e^2 = (dt / dx)^2 M / rho, k_v = dt / dx^2 eta s^2 / rho.
-        """
-        f00, f01, f10, f11 = F
-        J, trace = f00 * f11 - f01 * f10, f00**2 + f01**2 + f10**2 + f11**2
-        s2 = 0.5 * (trace + np.sqrt(np.maximum(trace**2 - 4.0 * J**2, 0.0)))
-        log, slope, bend = kernels.plain(lagrangian.continued)(J)
-        lam, mu, eta = self.data.constants[:, self._solid]
-        hardening = lam * slope**2 + (lam * log - mu) * bend
-        stiffness = mu + np.maximum(hardening, 0.0) * s2
-        stiffness_share, volume, mass = (
-            each[self._solid].real
-            for each in (self.data.stiffness, self.data.volume, self.data.mass)
-        )
-        specific = stiffness_share * volume / mass
-        step = self.scene.time_step / self.scene.grid.dx
-        viscous = step / self.scene.grid.dx * eta * s2 * specific
-        return float(np.max(viscous + np.sqrt(viscous**2 + step**2 * stiffness * specific)))
+        found = np.empty((len(slots), 5))
+        lattice_indicators.look(
+            states, np.array(slots, np.int64), self.lattice, self._number, self._reference,
+            self._solid, self.data, self.parameters, found,
+        )  # fmt: skip
+        seen = Indicators()
+        for courant, jacobian, *gap in found.tolist():
+            seen = seen.join(Indicators(courant, 0.0, jacobian, 0.0, 0.0, *gap))
+        return seen
 
     def checkpoints(self, wish: Checkpointing) -> Checkpoints:
         """As `Simulation.checkpoints`; what is stored are states of nodes."""
@@ -374,12 +349,12 @@ class _Watcher:
 
     def follow(self, states: NDArray, first: int, last: int) -> None:
         """Look at steps `first` to `last`, whose states are in slots 0, 1, ..."""
-        for step in range(first, last + 1):
-            nodes = states[step - first]
-            if step in self._wanted and step not in self.states:
-                self.states[step] = self._simulation.particle_state(nodes)
-            if step % LOOK == 0 or step == self._simulation.steps:
-                self.seen = self.seen.join(self._simulation.look(nodes))
+        simulation = self._simulation
+        for step in self._wanted - set(self.states):
+            if first <= step <= last:
+                self.states[step] = simulation.particle_state(states[step - first])
+        slots = looked_at(first, last, simulation.steps, LOOK)
+        self.seen = self.seen.join(simulation.look(states, slots))
 
 
 class LagrangianForward(Forward):

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from mpmopt.assess.feet import BEARS, FEET, feet
-from mpmopt.assess.robustness import SEEN, SETTLED, Robot, lasting
+from mpmopt.assess.robustness import SEEN, SETTLED, Robot, lasting, unit
 from mpmopt.assess.trajectory import Body, Motion
 from mpmopt.design.terms import Displacement
 from mpmopt.io.files import replace_file
@@ -60,8 +60,9 @@ def plot_stride(path: str | os.PathLike[str], robot: Robot) -> None:
         If the file cannot be written.
     """
     one = robot.period(robot.problem.scene)
-    scene = lasting(robot.problem.scene, SETTLED + one)
-    times = SETTLED + one * np.arange(INSTANTS) / INSTANTS
+    settled = SETTLED * unit(robot.problem.scene)
+    scene = lasting(robot.problem.scene, settled + one)
+    times = settled + one * np.arange(INSTANTS) / INSTANTS
     frames = np.rint(times / scene.time_step).astype(int)
     motion = Motion.of(body_of(robot, scene), [*frames, scene.steps])
     box = view([motion])
@@ -72,7 +73,7 @@ def plot_stride(path: str | os.PathLike[str], robot: Robot) -> None:
     figure = new_figure(10.0, (wide * height / width + 0.25) * rows + 0.35)
     way = motion.objective[-1] - motion.objective[0]
     figure.suptitle(
-        f"One period of {one:.3g} from t = {SETTLED:g}, in which the robot goes {way:.3g}",
+        f"One period of {one:.3g} from t = {settled:g}, in which the robot goes {way:.3g}",
         fontsize=10,
     )
     # Dotted: where its front was at first.
@@ -103,9 +104,10 @@ def plot_gait(path: str | os.PathLike[str], robot: Robot) -> None:
         If the file cannot be written.
     """
     one = robot.period(robot.problem.scene)
-    scene = lasting(robot.problem.scene, SEEN)
-    far = np.arange(0.0, SEEN, one / 8.0)
-    near = SETTLED + one * np.arange(PERIODS * PER_PERIOD + 1) / PER_PERIOD
+    settled, end = (time * unit(robot.problem.scene) for time in (SETTLED, SEEN))
+    scene = lasting(robot.problem.scene, end)
+    far = np.arange(0.0, end, one / 8.0)
+    near = settled + one * np.arange(PERIODS * PER_PERIOD + 1) / PER_PERIOD
     frames = np.unique(np.rint(np.concatenate([far, near]) / scene.time_step).astype(int))
     frames = frames[frames <= scene.steps]
     motion = Motion.of(body_of(robot, scene), frames)
@@ -115,7 +117,7 @@ def plot_gait(path: str | os.PathLike[str], robot: Robot) -> None:
     whole.plot(time, motion.objective, "k-", lw=1.2)
     whole.axvspan(near[0], near[-1], color="0.9")
     whole.set_ylabel("way of\nthe centroid")
-    whole.set_xlim(0.0, SEEN)
+    whole.set_xlim(0.0, end)
     seen = (time >= near[0] - 1e-9) & (time <= near[-1] + 1e-9)
     found = feet(motion)
     most = max((float(foot.load[seen].max()) for foot in found), default=0.0) or 1.0
@@ -139,7 +141,7 @@ def plot_gait(path: str | os.PathLike[str], robot: Robot) -> None:
     for axes in (place, height, ground):
         axes.set_xlim(near[0], near[-1])
         for k in range(PERIODS + 1):
-            axes.axvline(SETTLED + k * one, color="0.8", lw=0.6, zorder=0)
+            axes.axvline(settled + k * one, color="0.8", lw=0.6, zorder=0)
     half = "" if scene.mirror is None else "; one half"
     ground.set_xlabel(f"time t (lines: periods of the actuation; thick: bears{half})")
     replace_file(path, png(figure))
