@@ -119,7 +119,7 @@ def test_the_gradient_of_what_is_clamped_is_exact(rng, name):
 def on_ground(friction, *clamps):
     """The finger on a layer that is as near to what is held as to the rest."""
     floor = (Ground.floor(5.9 * C, friction=friction, thickness=C),)
-    return finger(*clamps, ground=floor, time_step=1e-3, steps=120)
+    return finger(*clamps, ground=floor, time_step=1e-3, steps=40)
 
 
 def symmetric(clamp, **changes):
@@ -132,9 +132,9 @@ def symmetric(clamp, **changes):
 @pytest.mark.parametrize(
     "scene",
     [
-        finger(),
-        moving(),
         on_ground(0.4),
+        finger(steps=30),
+        moving(steps=30),
         on_ground("stick", Clamp((1 * C, 5 * C), (6 * C, 10 * C), ((0.0, (0.0, 0.0)), PATH[1]))),
         symmetric(
             Clamp((9 * C, 5 * C), (11 * C, 9 * C), ((0.0, (0.0, 0.0)), (0.1, (0.0, 0.5 * C)))),
@@ -144,7 +144,7 @@ def symmetric(clamp, **changes):
             ),
         ),
     ],
-    ids=["held", "moving", "on ground", "sticks", "mirror"],
+    ids=["on ground", "held", "moving", "sticks", "mirror"],
 )
 def test_the_gradient_of_a_lattice_that_is_clamped_is_exact(rng, scene):
     scene = dataclasses.replace(scene, formulation="total", material=Material(viscosity=0.02))
