@@ -34,16 +34,17 @@ def continuation(time_step: float | None = None, most_iterations: int = 25) -> S
     )
 
 
-def gait(most_iterations: int) -> Settings:
+def gait(most_iterations: int, move_limit: float = 0.02) -> Settings:
     """One stage of plain moving asymptotes with short moves, black and white from the first design.
 
     Its edges are as wide as a particle, so that no grey is there whose gain could be lost. Every
     design counts without it all the same, so the best is at least as good as the start, which is a
     drawing that strides. That needs contact layers, finite friction and viscosity, where distance
-    is smooth, and the total Lagrangian formulation, whose void may be light.
+    is smooth, and the total Lagrangian formulation, whose void may be light. A gait of several
+    actuators needs shorter moves.
     """
     return Settings(
-        (Stage(100.0, solid=True, move_limit=0.02, subpixel=True),),
+        (Stage(100.0, solid=True, move_limit=move_limit, subpixel=True),),
         adapt_move_limit=False,
         sharpen_asymptotes=False,
         asymptote_min=0.01,
