@@ -73,7 +73,7 @@ CASES = {
         walker.START,
         TASK,
     ),
-    "preview": Case(rough(), gait(1e-3, 40), walker.slanted_legs_on_ground, walker.START, TASK),
+    "preview": Case(rough(), gait(1e-3, 20), walker.slanted_legs_on_ground, walker.START, TASK),
 }
 
 if __name__ == "__main__":
