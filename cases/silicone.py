@@ -72,7 +72,7 @@ def start(positions: np.ndarray) -> np.ndarray:
     return np.where(two_legs(positions), 1.0, -1.0)
 
 
-START = {"phi": start, "a": 1.0, "theta": 0.7, "b": -0.4, "omega": 0.0}
+START = {"phi": start, "a": 1.0, "theta": 0.7, "b": -0.2, "omega": 0.3}
 
 CASES = {
     "default": Case(silicone_walker(0.5), gait(120), two_legs, START, walker.TASK),
