@@ -7,7 +7,6 @@ on but a bottom far below, several actuators.
 """
 
 import sys
-from dataclasses import replace
 
 import numpy as np
 
