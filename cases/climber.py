@@ -7,7 +7,6 @@ on but a bottom far below, several actuators.
 """
 
 import sys
-from dataclasses import replace
 
 import numpy as np
 
@@ -54,7 +53,7 @@ def climber(cells: int, time_step: float, seconds: float) -> Scene:
 
 
 def three_pairs(positions: np.ndarray) -> np.ndarray:
-    """Two pairs of legs that lean down, close together, and one further down that leans up.
+    """A spine, two pairs of legs that lean down, and one further down that leans up.
 
     The best of 4786 drawings, of which only 15 climb 0.02 a second or more in all scenes.
     """
@@ -69,7 +68,7 @@ def three_pairs(positions: np.ndarray) -> np.ndarray:
             (21.8, -1.8, 4.3, 1.8),
         )
     ]
-    return np.any(legs, axis=0)
+    return np.any([*legs, away <= 2 / 6], axis=0)
 
 
 def start(positions: np.ndarray) -> np.ndarray:

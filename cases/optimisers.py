@@ -14,6 +14,7 @@ import sys
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -171,14 +172,9 @@ class Climb:
             self.best, self.violation = (solid, x, problem.chain.beta, e.value), violation
 
 
-def stage(ascent: Ascent, beta: float, time_step: float) -> Stage:
-    return replace(
-        STAGE,
-        beta=beta,
-        subpixel=ascent.subpixel,
-        time_step=time_step,
-        move_limit=ascent.move_limit,
-    )
+def stage(ascent: Ascent, beta: float) -> Stage:
+    """The preview's, as an ascent has it."""
+    return replace(STAGE, beta=beta, subpixel=ascent.subpixel, move_limit=ascent.move_limit)
 
 
 def climb(scene: Scene, ascent: Ascent, start: Mapping[str, Any], evaluations: int) -> Climb:
@@ -186,7 +182,7 @@ def climb(scene: Scene, ascent: Ascent, start: Mapping[str, Any], evaluations: i
     run, x = Climb(), None
     origin = Objective.of(scene, Problem(scene).particles).start
     for beta in ascent.betas:
-        at = stage(ascent, beta, scene.time_step)
+        at = stage(ascent, beta)
         problem, judge = (at.problem(scene, task=task) for task in (ascent.task, PRESENT.task))
         freedom = Freedom(scene, problem.size, ascent.task.variables)
         x = freedom.started(problem.join(**completed("climb", start)) if x is None else x)
@@ -267,12 +263,12 @@ def speeds(scene: Scene, ascent: Ascent, run: Climb) -> dict[str, float]:
     if run.best is None:
         return {"speed": math.nan, "worst": math.nan}
     _, x, beta, _ = run.best
-    problem = stage(ascent, beta, scene.time_step).problem(scene, task=PRESENT.task)
+    problem = stage(ascent, beta).problem(scene, task=PRESENT.task)
     robot, found = Robot.of(problem, x), []
     for variation in (Variation(), *(Variation(friction=each) for each in FRICTIONS)):
         there = variation.scene(problem.scene)
         try:
-            found.append(speed(robot, Trial(lambda there=there: there)))
+            found.append(speed(robot, Trial(partial(replace, there))))
         except (SceneError, SimulationError):
             found.append(math.nan)
     return {"speed": found[0], "worst": float(np.min(found))}

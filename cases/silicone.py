@@ -74,9 +74,12 @@ def start(positions: np.ndarray) -> np.ndarray:
 
 START = {"phi": start, "a": 1.0, "theta": 0.7, "b": -0.2, "omega": 0.3}
 
+# The walker's, in metres.
+TASK = replace(walker.TASK, soft_minimum=walker.TASK.soft_minimum / (64 * CELL))
+
 CASES = {
-    "default": Case(silicone_walker(0.5), gait(120), two_legs, START, walker.TASK),
-    "preview": Case(silicone_walker(), gait(40), two_legs, START, walker.TASK),
+    "default": Case(silicone_walker(0.5), gait(120), two_legs, START, TASK),
+    "preview": Case(silicone_walker(), gait(40), two_legs, START, TASK),
 }
 
 if __name__ == "__main__":

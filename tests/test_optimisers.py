@@ -20,8 +20,7 @@ def scene():
 
 def test_the_present_ascent_is_the_optimisers(scene):
     start = {"phi": lambda position: 0.3 * np.cos(40.0 * position[:, 0]), "a": 0.5}
-    settings = gait(scene.time_step, 4)
-    run = optimise(scene, settings, start, task=PRESENT.task)
+    run = optimise(scene, gait(4), start, task=PRESENT.task)
     mine = optimisers.climb(scene, PRESENT, start, 4)
     assert [value for value, _ in mine.history] == [item.objective for item in run.history]
     assert mine.best is not None
