@@ -94,7 +94,7 @@ def test_a_small_crawler_crawls_even_without_its_void(tmp_path):
 @pytest.mark.case
 def test_a_small_climber_climbs_even_without_its_void(tmp_path):
     settings = dataclasses.replace(SMALL.settings, least_iterations=10, most_iterations=10)
-    case = Case(climber.climber(64, 8e-4, 2.0), settings, climber.slanted_legs, climber.START)
+    case = Case(climber.climber(64, 8e-4, 2.0), settings, climber.three_pairs, climber.START)
     summary = run(case, tmp_path)
     assert summary["start"] <= 30 / 64  # where it is put: it sags
     assert summary["optimised"] - summary["reference"] >= 0.02

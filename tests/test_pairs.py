@@ -129,8 +129,8 @@ def test_what_moves_alike_keeps_its_lists_but_not_those_of_images(rng):
     kept, room = pairs.renewed(near, nodes, touch)
     assert np.array_equal(kept.cells_at, whole.start[:2])
     assert room == pytest.approx(pairs.HALF * pairs.WIDE_SKIN * C, rel=1e-9)
-    for axis, corners in (("x", IMAGES), ("y", RAILS)):
-        half = simulation_of(body(*corners, mirror=Mirror(axis, 8 * C)))
+    for mirror, corners in ((Mirror("x", 8 * C), IMAGES), (Mirror("y", 8 * C), RAILS)):
+        half = simulation_of(body(*corners, mirror=mirror))
         touch, nodes = half.lattice.touch, half.start.copy()
         near, seen = pairs.nowhere(touch), 0
         for _ in range(8):
