@@ -3,7 +3,7 @@
     python cases/silicone.py --preview --out DIR
 
 All of it is Ecoflex 00-30, so one mould and one pour make it. The middle of its beam is squeezed
-along the beam, by up to 12 kPa and 30 to 50 times a second: that is too quick for air, not for
+along the beam, by up to 8.4 kPa, 30 to 50 times a second: that is too quick for air, not for
 dielectric elastomers or magnets. The plane is a section, so masses and forces are those of a
 metre of depth: densities in kg/m^3 and stresses in Pa are those of the solid. The viscosity is an
 assumption: 20 Pa s is a loss factor of 0.064 in shear at 40 Hz. The ground yields by up to 1.5 mm.
