@@ -44,14 +44,14 @@ def step(height: float = C) -> Scene:
     return on(Ground(((0.0, 3 * C), (34 * C, 3 * C), (34 * C, up), (35 * C, up))))
 
 
-def hills(seed: int, depth: float = 2 * C, far: float = NEAR) -> Ground:
+def hills(seed: int, depth: float = C, far: float = NEAR) -> Ground:
     """Hills and hollows, every five cells, of which no hill is above the walker's floor."""
     places = np.arange(0.0, far, 5 * C)
     heights = 3 * C - depth * np.random.default_rng(seed).uniform(0.0, 1.0, len(places))
     return like_flat(Ground.heights(places.tolist(), heights.tolist()))
 
 
-def rough(seed: int = 0, depth: float = 2 * C, scene: Scene = FLAT) -> Scene:
+def rough(seed: int = 0, depth: float = C, scene: Scene = FLAT) -> Scene:
     """The walker on hills and hollows."""
     return on(hills(seed, depth, FAR), scene)
 

@@ -104,7 +104,7 @@ def test_a_body_without_design_is_audited_too():
 
 def test_a_wide_filter_is_no_obstacle_to_finer_cells():
     """Refined once more it would be too large for a scene, but solid bodies need none."""
-    scene = climber(128, 2e-4, 4.0)
+    scene = dataclasses.replace(climber(128, 2e-4, 4.0), filter_length=1.5 / 64)
     with pytest.raises(SceneError, match="shorter filter_length"):
         dataclasses.replace(refined(scene, 2), filter_length=scene.filter_length)
     assert refined(scene, 2).grid.cells == (256, 256)
