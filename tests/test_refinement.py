@@ -107,7 +107,7 @@ def test_a_wide_filter_is_no_obstacle_to_finer_cells():
     scene = dataclasses.replace(climber(128, 2e-4, 4.0), filter_length=1.5 / 64)
     with pytest.raises(SceneError, match="shorter filter_length"):
         dataclasses.replace(refined(scene, 2), filter_length=scene.filter_length)
-    assert refined(scene, 2).grid.cells == (256, 256)
+    assert refined(scene, 2).grid.cells == (256, 640)
 
 
 def test_no_share_of_a_gain_that_is_rounding(tmp_path, capsys):
