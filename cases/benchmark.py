@@ -29,6 +29,7 @@ from walker import walker, walker_on_ground
 from mpmopt.design.ensemble import side_by_side
 from mpmopt.design.objective import Objective
 from mpmopt.design.problem import Problem
+from mpmopt.scene.scene import Formulation
 from mpmopt.simulation.checkpoints import Checkpointing
 from mpmopt.simulation.simulation import Simulation
 
@@ -122,7 +123,9 @@ def threads_and_schedules(steps: int, rounds: int) -> str:
     return table(f"The paper's walker, {steps} steps, by threads and schedule", header, rows)
 
 
-def on_ground(cells: int, steps: int, formulation: str = "total") -> tuple[Simulation, Objective]:
+def on_ground(
+    cells: int, steps: int, formulation: Formulation = "total"
+) -> tuple[Simulation, Objective]:
     """The walker on ground, with its layer and viscosity."""
     scene = walker_on_ground(cells, 2e-4 * 128 / cells, 4.0)
     problem = Problem(replace(scene, steps=steps, transient=0.0, formulation=formulation))
@@ -140,7 +143,8 @@ def several(scenes: int, simulation: Simulation, objective: Objective) -> Run:
 def formulations(steps: int, rounds: int) -> str:
     """The walker on ground, viscous, in both formulations, by one thread."""
     runs: dict[str, Run] = {}
-    for kind in ("updated", "total"):
+    kinds: tuple[Formulation, ...] = ("updated", "total")
+    for kind in kinds:
         simulation, objective = on_ground(128, steps, kind)
         count = simulation.initial.shape[1]
         runs[f"forward {kind}"] = with_threads(1, simulation.run)

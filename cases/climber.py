@@ -7,27 +7,31 @@ on but a bottom far below, several actuators.
 """
 
 import sys
-from dataclasses import replace
 
 import numpy as np
 
 from mpmopt.app.case import Case
 from mpmopt.app.script import main
+from mpmopt.design.one_piece import OnePiece
+from mpmopt.design.task import AtMost, Task
+from mpmopt.design.variables import Bounded, Tied
 from mpmopt.design.variation import Variation
-from mpmopt.optimisation.presets import IN_ONE_PIECE, creep
+from mpmopt.optimisation.presets import gait
 from mpmopt.scene import Actuator, Design, Grid, Ground, Material, Mirror, Scene
 
 
 def climber(cells: int, time_step: float, seconds: float) -> Scene:
-    """The climber on `cells` x `cells` cells; what comes in the first second does not count."""
+    """The climber on `cells` cells across; what comes in the first second does not count."""
     c = 1 / 64
     left, right, low, high = 26 * c, 38 * c, 18 * c, 42 * c  # of the body
     # The shaft's layers are a cell thick and squeeze the body a little, so that it holds at first.
     walls, bottom = (25.3 * c, 38.7 * c), 4 * c
     shaft = ((walls[0], 1.0), (walls[0], bottom), (walls[1], bottom), (walls[1], 1.0))
-    actuators = tuple(Actuator((30 * c, y * c), (34 * c, (y + 6) * c)) for y in (21, 27, 33))
+    actuators = tuple(
+        Actuator((30 * c, y * c), (34 * c, (y + 6) * c), detuning=0.9) for y in (21, 27, 33)
+    )
     return Scene(
-        grid=Grid(cells=(cells, cells), dx=1 / cells),
+        grid=Grid(cells=(cells, 5 * cells // 2), dx=1 / cells),
         time_step=time_step,
         steps=round(seconds / time_step),
         transient=1.0,
@@ -43,35 +47,52 @@ def climber(cells: int, time_step: float, seconds: float) -> Scene:
             Design((34 * c, 21 * c), (right, 39 * c)),
             Design((left, 39 * c), (right, high)),
         ),
-        filter_length=1.5 * c,  # thin legs slip on finer cells
+        filter_length=2 * c,
         mirror=Mirror("x", 32 * c),
     )
 
 
-def slanted_legs(positions: np.ndarray) -> np.ndarray:
-    """What one would draw by hand: four pairs of legs that lean down."""
+def three_pairs(positions: np.ndarray) -> np.ndarray:
+    """A spine, two pairs of legs that lean down, and one further down that leans up.
+
+    The best of 4786 drawings, of which only 15 climb 0.02 a second or more in all scenes.
+    """
     c = 1 / 64
     x, y = positions.T
-    foot = 4 * c * abs(x - 32 * c) / (6 * c)  # how far down a leg has leant at this distance
-    return np.any([abs(y + foot - top * c) <= 1.25 * c for top in (24, 30, 36, 41)], axis=0)
+    away = abs(x - 32 * c) / (6 * c)
+    legs = [
+        abs(y + slant * c * away - top * c) <= 0.5 * c * (root + (foot - root) * away)
+        for top, slant, root, foot in (
+            (35.4, 3.1, 4.2, 3.6),
+            (31.8, 2.7, 3.8, 3.2),
+            (21.8, -1.8, 4.3, 1.8),
+        )
+    ]
+    return np.any([*legs, away <= 2 / 6], axis=0)
 
 
-# Three cores a quarter of a turn apart, the lowest first; squeezed outwards on the average.
-START = {"phi": 0.0, "a": 1.0, "theta": (0.7, 0.2, -0.3), "b": -0.5}
+def start(positions: np.ndarray) -> np.ndarray:
+    """The drawing, black and white."""
+    return np.where(three_pairs(positions), 1.0, -1.0)
 
-TASK = replace(
-    IN_ONE_PIECE,
+
+START = {"phi": start, "a": 1.0, "theta": (-0.8, -0.5, -0.7), "b": -0.3, "omega": 0.9}
+
+# Cores of one frequency: others would drift out of step.
+TASK = Task(
+    subject_to=(AtMost(OnePiece(), -0.4),),
     scenes=(
-        Variation(friction=0.7, strength=0.9, threshold=0.4),
+        Variation(friction=0.7, strength=0.9),
         Variation(friction=0.9),
-        Variation(friction=1.2, strength=1.1, threshold=0.6),
+        Variation(friction=1.2, strength=1.1),
     ),
+    variables=(Bounded("b", lower=-0.5, upper=0.5), Tied("omega", to=0)),
     soft_minimum=8.0,
 )
 
 CASES = {
-    "default": Case(climber(64, 1e-3, 4.0), creep(1e-3, 25), slanted_legs, START, TASK),
-    "preview": Case(climber(64, 1e-3, 3.0), creep(1e-3, 15), slanted_legs, START, TASK),
+    "default": Case(climber(64, 1e-3, 4.0), gait(120, 0.005), three_pairs, START, TASK),
+    "preview": Case(climber(64, 1e-3, 3.0), gait(40, 0.005), three_pairs, START, TASK),
 }
 
 if __name__ == "__main__":

@@ -17,8 +17,9 @@ from mpmopt.app.case import Case
 from mpmopt.app.script import main
 from mpmopt.design.one_piece import OnePiece
 from mpmopt.design.task import AtMost, Task
+from mpmopt.design.variables import Bounded
 from mpmopt.design.variation import Variation
-from mpmopt.optimisation.presets import creep, paper_preset
+from mpmopt.optimisation.presets import gait, paper_preset
 from mpmopt.scene import Actuator, Design, Grid, Ground, Material, Mirror, Scene, Wall
 
 
@@ -47,7 +48,8 @@ def crawler(cells: int, time_step: float, mirror: bool = True) -> Scene:
 def crawler_on_ground(cells: int, time_step: float, seconds: float) -> Scene:
     """The same body in a longer channel with layers, and with a frequency that is designed too.
 
-    What comes in the first second does not count.
+    Its layers squeeze the body a little, so that it does not coast. What comes in the first second
+    does not count.
     """
     c = 1 / 64
     scene = crawler(cells, time_step)
@@ -57,8 +59,8 @@ def crawler_on_ground(cells: int, time_step: float, seconds: float) -> Scene:
         grid=Grid(cells=(2 * cells, cells), dx=1 / cells),
         walls=(),
         ground=(
-            Ground.floor(25 * c, **layer),
-            Ground(((1.0, 39 * c), (0.0, 39 * c)), **layer),
+            Ground.floor(25.3 * c, **layer),
+            Ground(((1.0, 38.7 * c), (0.0, 38.7 * c)), **layer),
         ),
         body=tuple(
             replace(part, detuning=0.9) if isinstance(part, Actuator) else part
@@ -82,8 +84,28 @@ def slanted_legs(positions: np.ndarray) -> np.ndarray:
     return np.any([*legs, height <= 1.5 * c], axis=0)
 
 
-# A little noise: at an even start the gradient by the phase is rounding.
-START = {"phi": np.random.default_rng(1).uniform(-0.05, 0.05, 408), "omega": 0.5}  # 102 cells
+def two_pairs(positions: np.ndarray) -> np.ndarray:
+    """A spine, a skin around the core, and two pairs of legs, of which those in front lean back.
+
+    One of the best of 1273 drawings; one in six goes 0.02 a second or more in all scenes.
+    """
+    c = 1 / 64
+    x, y = positions.T
+    height = abs(y - 32 * c) / (6 * c)
+    legs = [
+        abs(x + slant * c * height - top * c) <= 0.5 * c * (4 + (foot - 4) * height)
+        for top, slant, foot in ((34.5, 4.0, 2.0), (19.0, -1.0, 3.5))
+    ]
+    skin = (height <= 4 / 6) & (x >= 19 * c) & (x <= 27 * c)
+    return np.any([*legs, height <= 2 / 6, skin], axis=0)
+
+
+def start(positions: np.ndarray) -> np.ndarray:
+    """The drawing, black and white."""
+    return np.where(two_pairs(positions), 1.0, -1.0)
+
+
+START = {"phi": start, "a": 1.0, "theta": 0.6, "b": -0.3, "omega": 0.7}
 
 # Its actuator takes heat from three sides, so the bound of other robots would let small corners go.
 TASK = Task(
@@ -93,12 +115,13 @@ TASK = Task(
         Variation(friction=0.45),
         Variation(friction=0.72, strength=1.1),
     ),
+    variables=(Bounded("b", lower=-0.4, upper=0.4),),
     soft_minimum=8.0,
 )
 
 CASES = {
-    "default": Case(crawler_on_ground(64, 1e-3, 4.0), creep(1e-3, 25), slanted_legs, START, TASK),
-    "preview": Case(crawler_on_ground(64, 1e-3, 3.0), creep(1e-3, 15), slanted_legs, START, TASK),
+    "default": Case(crawler_on_ground(64, 1e-3, 4.0), gait(120), two_pairs, START, TASK),
+    "preview": Case(crawler_on_ground(64, 1e-3, 3.0), gait(40), two_pairs, START, TASK),
     "paper": Case(crawler(128, 2e-4), paper_preset(2e-4), slanted_legs),
 }
 

@@ -2,8 +2,8 @@
 
     python cases/optimisers.py --out DIR
 
-Each goes through the same number of evaluations from the case's own start and from others, whose
-noise differs. Leaves a JSON file of each run, of them ``optimisers.csv``, and of the starts of each
+Each goes through the same number of evaluations from the case's own start and from those of
+``--starts``. Leaves a JSON file of each run, of them ``optimisers.csv``, and of the starts of each
 ascent ``optimisers_summary.csv``. A run whose file is there is not made again.
 """
 
@@ -12,8 +12,9 @@ import json
 import math
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ import numpy as np
 import walker
 from numpy.typing import NDArray
 
+from mpmopt.app.multistart import random_start
 from mpmopt.app.sweeps import as_csv
 from mpmopt.assess import threshold
 from mpmopt.assess.robustness import Robot, Trial, speed
@@ -33,11 +35,14 @@ from mpmopt.design.variation import Variation
 from mpmopt.errors import SceneError, SimulationError
 from mpmopt.io.console import reported
 from mpmopt.io.files import make_folder, replace_file
+from mpmopt.optimisation.loop import LENGTHEN, SHORTEN
 from mpmopt.optimisation.mma import Array, MovingAsymptotes
 from mpmopt.optimisation.settings import Stage
 from mpmopt.scene import Scene
 
-EVALUATIONS = 40
+PREVIEW = walker.CASES["preview"]
+(STAGE,) = PREVIEW.settings.stages
+EVALUATIONS = PREVIEW.settings.most_iterations
 MOST_FAILURES = 8  # in a row
 FRICTIONS = (0.3, 0.8)
 STILL = 1e-3  # a turn of less than this, in squares of ranges, changes an asymptote less
@@ -60,13 +65,15 @@ class SmoothAsymptotes(MovingAsymptotes):
 
 @dataclass(frozen=True)
 class Ascent:
-    """How to climb; the defaults are what `presets.gait` and the walker's task do.
+    """How to climb; the defaults are what the walker's preview does.
 
     Attributes
     ----------
     betas : tuple of float
         Sharpness of the projection, each for an equal share of the evaluations.
-    move_limit, raa0, mma
+    subpixel : bool
+        `Stage.subpixel`.
+    move_limit, raa0, asymptote_min, mma
         Of the moving asymptotes (`MovingAsymptotes`).
     adapt : bool
         `Settings.adapt_move_limit`.
@@ -78,20 +85,19 @@ class Ascent:
         Share of the last gradient in the one that is followed.
     restart : float
         Below this share of the best displacement go back to its design, with half the move limit.
-    amplitude : float
-        Factor on the start's phi.
     """
 
-    betas: tuple[float, ...] = (8.0,)
-    move_limit: float = 0.05
+    betas: tuple[float, ...] = (STAGE.beta,)
+    subpixel: bool = STAGE.subpixel
+    move_limit: float = STAGE.move_limit
     raa0: float = 1e-5
+    asymptote_min: float = PREVIEW.settings.asymptote_min
     mma: type[MovingAsymptotes] = MovingAsymptotes
     adapt: bool = False
-    soft_minimum: float = 8.0
+    soft_minimum: float = walker.TASK.soft_minimum
     scenes: tuple[Variation, ...] = walker.TASK.scenes
     memory: float = 0.0
     restart: float = 0.0
-    amplitude: float = 1.0
 
     @property
     def task(self) -> Task:
@@ -110,27 +116,26 @@ def around(scenes: tuple[Variation, ...], by: float) -> tuple[Variation, ...]:
 PRESENT = Ascent()
 ASCENTS: Mapping[str, Ascent] = {
     "present": PRESENT,
-    "beta 4 to 32": replace(PRESENT, betas=(4.0, 8.0, 16.0, 32.0)),
-    "beta 4": replace(PRESENT, betas=(4.0,)),
+    "plain projection": replace(PRESENT, betas=(8.0,), subpixel=False),
+    "beta 4 to 32": replace(PRESENT, betas=(4.0, 8.0, 16.0, 32.0), subpixel=False),
     "mean": replace(PRESENT, soft_minimum=0.0),
     "gradient over strengths": replace(PRESENT, scenes=around(walker.TASK.scenes, 0.02)),
     "gradient with memory": replace(PRESENT, memory=0.7),
     "smooth asymptotes": replace(PRESENT, mma=SmoothAsymptotes),
     "convex": replace(PRESENT, raa0=0.1),
     "restart": replace(PRESENT, restart=0.7),
-    "shorter moves": replace(PRESENT, move_limit=0.025),
+    "longer moves": replace(PRESENT, move_limit=0.05),
     "adapted moves": replace(PRESENT, adapt=True),
-    "paler start": replace(PRESENT, amplitude=0.5),
 }
 
 
-def drawing(seed: int, amplitude: float) -> Any:
-    """The walker's start with other noise; seed 1 is its own."""
+def other_start(seed: int) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
+    """The walker's phi and, but for seed 0, a random field, as `--starts` does."""
+    noise = random_start(PREVIEW.scene, seed)
 
     def phi(positions: NDArray[np.float64]) -> NDArray[np.float64]:
-        noise = np.random.default_rng(seed).uniform(-0.05, 0.05, len(positions))
-        there = walker.slanted_legs_on_ground(positions)
-        return amplitude * (np.where(there, 0.8, -0.8) + noise)
+        own = walker.start(positions)
+        return np.clip(own + noise(positions), -1.0, 1.0) if seed else own
 
     return phi
 
@@ -145,10 +150,13 @@ class Climb:
         Of each evaluation the objective with grey and without; not a number where it failed.
     best : (float, (n,) array, float, float), optional
         Objective without grey of the best design, the design, its beta and objective with grey.
+    violation : float
+        Its `Task.violation`.
     """
 
     history: list[tuple[float, float]] = field(default_factory=list)
     best: tuple[float, NDArray[np.float64], float, float] | None = None
+    violation: float = math.inf
 
     def without_grey(self, problem: Problem, x: NDArray[np.float64], e: Evaluation) -> None:
         """Judge a design as `Stage.solid` does."""
@@ -157,13 +165,16 @@ class Climb:
         except (SceneError, SimulationError):
             solid = math.nan
         self.history.append((e.value, solid))
-        met = problem.task.violation(e.constraints) == 0.0
-        if met and solid > (self.best[0] if self.best else -math.inf):
-            self.best = solid, x, problem.chain.beta, e.value
+        violation = problem.task.violation(e.constraints)
+        if math.isnan(solid):
+            return
+        if self.best is None or (-violation, solid) > (-self.violation, self.best[0]):
+            self.best, self.violation = (solid, x, problem.chain.beta, e.value), violation
 
 
-def stage(ascent: Ascent, beta: float, time_step: float) -> Stage:
-    return Stage(beta, 2e-3, 2e-4, time_step, solid=True, move_limit=ascent.move_limit)
+def stage(ascent: Ascent, beta: float) -> Stage:
+    """The preview's, as an ascent has it."""
+    return replace(STAGE, beta=beta, subpixel=ascent.subpixel, move_limit=ascent.move_limit)
 
 
 def climb(scene: Scene, ascent: Ascent, start: Mapping[str, Any], evaluations: int) -> Climb:
@@ -171,7 +182,7 @@ def climb(scene: Scene, ascent: Ascent, start: Mapping[str, Any], evaluations: i
     run, x = Climb(), None
     origin = Objective.of(scene, Problem(scene).particles).start
     for beta in ascent.betas:
-        at = stage(ascent, beta, scene.time_step)
+        at = stage(ascent, beta)
         problem, judge = (at.problem(scene, task=task) for task in (ascent.task, PRESENT.task))
         freedom = Freedom(scene, problem.size, ascent.task.variables)
         x = freedom.started(problem.join(**completed("climb", start)) if x is None else x)
@@ -190,12 +201,23 @@ def _one_beta(
     origin: float,
 ) -> NDArray[np.float64]:
     """The evaluations at one beta; returns the best design as it is, for the next."""
-    mma = ascent.mma(freedom.lower, freedom.upper, move_limit=ascent.move_limit, raa0=ascent.raa0)
+    mma = ascent.mma(
+        freedom.lower,
+        freedom.upper,
+        move_limit=ascent.move_limit,
+        asymptote_min=ascent.asymptote_min,
+        raa0=ascent.raa0,
+    )
     width, (constraint,) = max(problem.scene.grid.size), problem.task.subject_to
     top: tuple[NDArray[np.float64], Evaluation] | None = None
     slope: NDArray[np.float64] | None = None
     last, failures = math.nan, 0
+
+    def rank(e: Evaluation) -> tuple[float, float]:
+        return -problem.task.violation(e.constraints), e.value
+
     for _ in range(evaluations // len(ascent.betas)):
+        back = False
         try:
             e = problem.evaluate(x)
         except SimulationError:
@@ -203,22 +225,22 @@ def _one_beta(
             failures += 1
             if top is None or failures == MOST_FAILURES:
                 break
+            back = True
+        else:
+            failures = 0
+            run.without_grey(judge, x, e)
+            if top is None or rank(e) > rank(top[1]):
+                top = x, e
+            best = top[1].value - origin
+            back = ascent.restart > 0.0 and e.value - origin < ascent.restart * best
+        if back:
             (x, e), slope = top, None
             mma.reset()
             mma.move_limit /= 2.0
         else:
-            failures = 0
-            run.without_grey(judge, x, e)
-            if top is None or e.value > top[1].value:
-                top = x, e
-            elif e.value - origin < ascent.restart * (top[1].value - origin):
-                (x, e), slope = top, None
-                mma.reset()
-                mma.move_limit /= 2.0
-        if ascent.adapt and not math.isnan(last):
-            factor = 0.6 if e.value < last else 1.2
+            factor = SHORTEN if ascent.adapt and e.value < last else LENGTHEN
             mma.move_limit = min(ascent.move_limit, factor * mma.move_limit)
-        last = e.value
+            last = e.value
         gradients = freedom.pullback(e.gradients)
         slope = (
             gradients[0]
@@ -236,17 +258,17 @@ def _one_beta(
     return top[0] if top else x
 
 
-def speeds(scene: Scene, run: Climb) -> dict[str, float]:
+def speeds(scene: Scene, ascent: Ascent, run: Climb) -> dict[str, float]:
     """Speed of the finished robot, and the least over frictions; not a number if it fails."""
     if run.best is None:
         return {"speed": math.nan, "worst": math.nan}
     _, x, beta, _ = run.best
-    problem = stage(PRESENT, beta, scene.time_step).problem(scene, task=PRESENT.task)
+    problem = stage(ascent, beta).problem(scene, task=PRESENT.task)
     robot, found = Robot.of(problem, x), []
     for variation in (Variation(), *(Variation(friction=each) for each in FRICTIONS)):
         there = variation.scene(problem.scene)
         try:
-            found.append(speed(robot, Trial(lambda there=there: there)))
+            found.append(speed(robot, Trial(partial(replace, there))))
         except (SceneError, SimulationError):
             found.append(math.nan)
     return {"speed": found[0], "worst": float(np.min(found))}
@@ -257,17 +279,17 @@ def one(name: str, seed: int, path: Path, evaluations: int) -> dict[str, Any]:
     if path.exists():
         kept: dict[str, Any] = json.loads(path.read_text())
         return kept
-    case, ascent, began = walker.CASES["preview"], ASCENTS[name], time.process_time()
-    start = {**case.start, "phi": drawing(seed, ascent.amplitude)}
-    run = climb(case.scene, ascent, start, evaluations)
+    ascent, began = ASCENTS[name], time.process_time()
+    start = {**PREVIEW.start, "phi": other_start(seed)}
+    run = climb(PREVIEW.scene, ascent, start, evaluations)
     used = time.process_time() - began
-    origin = Objective.of(case.scene, Problem(case.scene).particles).start
+    origin = Objective.of(PREVIEW.scene, Problem(PREVIEW.scene).particles).start
     grey = run.best[3] - origin if run.best else math.nan
     solid = run.best[0] - origin if run.best else math.nan
     row = {
         "ascent": name,
         "start": seed,
-        **speeds(case.scene, run),
+        **speeds(PREVIEW.scene, ascent, run),
         "with grey": grey,
         "without": solid,
         "loss": 1.0 - solid / grey,
@@ -307,19 +329,24 @@ def summary(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def compare(names: list[str], starts: int, out: Path, evaluations: int = EVALUATIONS) -> str:
-    """Make the runs that are not there yet, and both tables; returns the second."""
+    """Make the runs that are not there yet, and both tables of all that are; returns the second."""
     make_folder(out)
-    rows: list[dict[str, Any]] = []
-    for seed in range(1, starts + 1):
+    table = ""
+    for seed in range(starts):
         for name in names:
-            path = out / f"{name.replace(' ', '_')}-{seed}.json"
-            rows.append(one(name, seed, path, evaluations))
-            print(f"{name}, start {seed}: speed {rows[-1]['speed']:.3g}", flush=True)
+            found = one(name, seed, _path(out, name, seed), evaluations)
+            print(f"{name}, start {seed}: speed {found['speed']:.3g}", flush=True)
+            paths = [_path(out, each, k) for each in ASCENTS for k in range(starts)]
+            rows = [json.loads(path.read_text()) for path in paths if path.exists()]
             plain = [{k: v for k, v in row.items() if k != "history"} for row in rows]
             replace_file(out / "optimisers.csv", as_csv(plain, digits=4).encode())
-    table = as_csv(summary(rows), digits=3)
-    replace_file(out / "optimisers_summary.csv", table.encode())
+            table = as_csv(summary(rows), digits=3)
+            replace_file(out / "optimisers_summary.csv", table.encode())
     return table
+
+
+def _path(out: Path, name: str, seed: int) -> Path:
+    return out / f"{name.replace(' ', '_')}-{seed}.json"
 
 
 def main(argv: list[str] | None = None) -> int:

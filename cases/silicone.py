@@ -57,29 +57,29 @@ def silicone_walker(seconds: float = 0.35) -> Scene:
             ),
             Solid(at(15, 7), at(20, 10)),
         ),
-        filter_length=CELL,
+        filter_length=2 * CELL,
         formulation="total",
     )
 
 
-def slanted_legs(positions: np.ndarray) -> np.ndarray:
-    """The walker's drawing: a thin hind leg and a wide front leg that lean back."""
-    x, y = (positions - (LEFT, FOOT)).T / CELL
-    lean = 3.3 * (7 - y) / 7  # how far back a leg has leant at this height
-    return np.any([abs(x + lean - top) <= 1.0 for top in (12, 20, 21)], axis=0)
+def two_legs(positions: np.ndarray) -> np.ndarray:
+    """The walker's drawing, on these cells."""
+    return walker.two_legs(((positions - (LEFT, FOOT)) / CELL + (11, 4)) / 64)
 
 
 def start(positions: np.ndarray) -> np.ndarray:
-    """The drawing, faintly, with a little noise so that nothing is even."""
-    noise = np.random.default_rng(1).uniform(-0.05, 0.05, len(positions))
-    return np.where(slanted_legs(positions), 0.8, -0.8) + noise
+    """The drawing, black and white."""
+    return np.where(two_legs(positions), 1.0, -1.0)
 
 
-START = {"phi": start}
+START = {"phi": start, "a": 1.0, "theta": 0.7, "b": -0.2, "omega": 0.3}
+
+# The walker's, in metres.
+TASK = replace(walker.TASK, soft_minimum=walker.TASK.soft_minimum / (64 * CELL))
 
 CASES = {
-    "default": Case(silicone_walker(0.5), gait(TIME_STEP, 120), slanted_legs, START, walker.TASK),
-    "preview": Case(silicone_walker(), gait(TIME_STEP, 40), slanted_legs, START, walker.TASK),
+    "default": Case(silicone_walker(0.5), gait(120), two_legs, START, TASK),
+    "preview": Case(silicone_walker(), gait(40), two_legs, START, TASK),
 }
 
 if __name__ == "__main__":

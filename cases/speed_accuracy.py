@@ -512,10 +512,12 @@ def enough(points: Sequence[Point], error: float) -> Point | None:
 
 
 def at_equal_accuracy(points: Sequence[Point], apart: dict[str, float]) -> list[dict[str, str]]:
-    """What a distance of a given accuracy costs in both formulations."""
+    """What a distance costs in both formulations, to accuracies that both agree on."""
     rows = []
     for name in apart:
         for error in (0.2, 0.15, 0.1, 0.05, 0.02, 0.01, 0.005, 0.001):
+            if error < apart[name]:
+                break
             row = {"scene": name, "off by at most": f"{100.0 * error:g} %"}
             found = []
             for formulation in ("updated", "total"):

@@ -68,12 +68,12 @@ TASK = replace(
 CASES = {
     "default": Case(
         rough(scene=walker.CASES["default"].scene),
-        gait(1e-3, 120),
-        walker.slanted_legs_on_ground,
+        gait(120),
+        walker.two_legs,
         walker.START,
         TASK,
     ),
-    "preview": Case(rough(), gait(1e-3, 40), walker.slanted_legs_on_ground, walker.START, TASK),
+    "preview": Case(rough(), gait(40), walker.two_legs, walker.START, TASK),
 }
 
 if __name__ == "__main__":

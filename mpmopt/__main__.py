@@ -529,7 +529,7 @@ def _parser() -> argparse.ArgumentParser:
         "find the cheapest discretisation that is accurate enough",
         "Measure the best design in one discretisation after the other, from the cheapest on,\n"
         "until travel and gradient agree with the finest that is affordable; in both formulations\n"
-        "where the scene has neither walls nor clamps.",
+        "where the scene has no walls.",
         "out/walker/run.h5 --tol 0.1",
         "out/walker/run.h5 --tol 0.05 --gradient-tol inf --seconds 300",
     )

@@ -21,12 +21,12 @@ from mpmopt.app import case as one_case
 from mpmopt.app.case import Case, resume, run
 from mpmopt.app.script import main
 from mpmopt.assess.threshold import pieces
+from mpmopt.design.one_piece import OnePiece
 from mpmopt.design.problem import Problem
 from mpmopt.design.task import Task
 from mpmopt.design.variables import START
 from mpmopt.errors import DesignError, RunFileError, StorageError
 from mpmopt.optimisation.loop import optimise
-from mpmopt.optimisation.presets import IN_ONE_PIECE
 from mpmopt.optimisation.settings import Settings, Stage
 from mpmopt.results import runfile
 from mpmopt.view import plot
@@ -94,7 +94,7 @@ def test_a_small_crawler_crawls_even_without_its_void(tmp_path):
 @pytest.mark.case
 def test_a_small_climber_climbs_even_without_its_void(tmp_path):
     settings = dataclasses.replace(SMALL.settings, least_iterations=10, most_iterations=10)
-    case = Case(climber.climber(64, 8e-4, 2.0), settings, climber.slanted_legs, climber.START)
+    case = Case(climber.climber(64, 8e-4, 2.0), settings, climber.three_pairs, climber.START)
     summary = run(case, tmp_path)
     assert summary["start"] <= 30 / 64  # where it is put: it sags
     assert summary["optimised"] - summary["reference"] >= 0.02
@@ -282,11 +282,11 @@ def test_the_walkers_settings_are_those_of_the_design():
         assert (case.scene.grid.dx, case.scene.time_step) == (1 / 64, 1e-3)
         assert not case.scene.walls
         assert case.scene.ground
-        assert case.task.subject_to == IN_ONE_PIECE.subject_to
+        (bound,) = case.task.subject_to
+        assert isinstance(bound.term, OnePiece)
         assert len(case.task.scenes) == 3
         assert case.scene.formulation == "total"
-        floors = {(s.void_density, s.void_stiffness) for s in case.settings.stages}
-        assert floors == {(2e-3, 2e-4)}
+        assert [stage.subpixel for stage in case.settings.stages] == [True]
     assert default.scene.steps > preview.scene.steps
     assert not paper.scene.ground
     assert (paper.scene, paper.task) == (walker(128, 2e-4), Task())

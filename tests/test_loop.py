@@ -293,7 +293,7 @@ def test_a_stage_that_never_runs_gives_up_after_three_halvings(scene, start, mon
     [
         {"beta": -1.0},
         {"beta": "a"},
-        {"void_density": None},
+        {"void_density": 0.0},
         {"time_step": 0.0},
         {"void_stiffness": np.nan},
         {"move_limit": 0.0},

@@ -143,7 +143,7 @@ def test_starts_leave_their_runs_and_are_run_once(tmp_path, capsys, caplog):
 def test_the_plain_start_is_that_of_the_case(tmp_path, here):
     case = Case(
         dataclasses.replace(climber.climber(64, 8e-4, 2.0), steps=5, transient=0.0), TINY.settings,
-        climber.slanted_legs, climber.START,
+        climber.three_pairs, climber.START,
     )  # fmt: skip
     run(case, tmp_path / "alone")
     multistart.multistart(case, tmp_path, 1)

@@ -20,7 +20,7 @@ def scene():
 
 def test_the_present_ascent_is_the_optimisers(scene):
     start = {"phi": lambda position: 0.3 * np.cos(40.0 * position[:, 0]), "a": 0.5}
-    run = optimise(scene, gait(scene.time_step, 4), start, task=PRESENT.task)
+    run = optimise(scene, gait(4), start, task=PRESENT.task)
     mine = optimisers.climb(scene, PRESENT, start, 4)
     assert [value for value, _ in mine.history] == [item.objective for item in run.history]
     assert mine.best is not None
@@ -30,7 +30,8 @@ def test_the_present_ascent_is_the_optimisers(scene):
 
 def test_an_ascent_goes_as_many_evaluations_whatever_its_stages(scene):
     start = {"phi": 0.2, "a": 0.5}
-    doubled = replace(PRESENT, betas=(4.0, 8.0), memory=0.5, restart=0.9, adapt=True)
+    ascent = ASCENTS["beta 4 to 32"]
+    doubled = replace(ascent, betas=(4.0, 8.0), memory=0.5, restart=0.9, adapt=True)
     assert len(optimisers.climb(scene, doubled, start, 4).history) == 4
 
 

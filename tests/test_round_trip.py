@@ -32,6 +32,7 @@ def distinct(kind, **given):
                 "int": lambda n=n: n,
                 "int | None": lambda n=n: n,
                 "float": lambda n=n: 1.0 / n,
+                "float | None": lambda n=n: 1.0 / n,
                 "tuple[float, ...]": lambda n=n: (1.0 / n, -float(n)),
                 "str": lambda n=n: f"text {n}",
                 "bool": lambda field=field: field.default is not True,

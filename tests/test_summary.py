@@ -287,17 +287,16 @@ def test_the_presets_are_what_they_say():
     assert [stage.void_cutoff > 0.0 for stage in sharp.stages] == late
     assert (sharp.adapt_move_limit, sharp.sharpen_asymptotes, sharp.best_first) == 3 * (True,)
 
-    gait = presets.gait(1e-3, 12)
+    gait = presets.gait(12)
     (stage,) = gait.stages
-    assert (stage.beta, stage.solid, stage.move_limit, stage.time_step) == (8.0, True, 0.05, 1e-3)
-    assert (stage.void_density, stage.void_stiffness) == (2e-3, 2e-4)
+    assert (stage.subpixel, stage.solid, stage.move_limit, stage.time_step) == (
+        True,
+        True,
+        0.02,
+        None,
+    )
     assert (gait.adapt_move_limit, gait.tolerance, gait.most_iterations) == (False, 0.0, 12)
-
-    creep = presets.creep(1e-3, 12)
-    assert [stage.beta for stage in creep.stages] == [4.0, 8.0, 16.0, 32.0]
-    assert [stage.solid for stage in creep.stages] == 2 * [False] + 2 * [True]
-    assert {(stage.move_limit, stage.void_density) for stage in creep.stages} == {(0.1, 2e-3)}
-    assert (creep.adapt_move_limit, creep.most_iterations) == (True, 12)
+    assert gait.asymptote_min == 0.01
 
     paper = presets.paper_preset(1e-3)
     assert [stage.beta for stage in paper.stages] == [0.5, 1.0, 2.0, 4.0, 8.0, 16.0]

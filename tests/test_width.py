@@ -9,6 +9,7 @@ import pytest
 from scipy.optimize import brentq
 from scipy.sparse import csc_array
 from scipy.sparse.linalg import splu
+from scipy.special import ndtri
 
 from mpmopt.assess.width import least_width, thinnest_gap, thinnest_member
 from mpmopt.design.one_piece import _lattice
@@ -111,6 +112,31 @@ def test_a_bar_that_just_reaches_a_threshold_is_as_wide_as_theory_says(sign, thr
     ]
     measured = thinnest_member(rings) if sign > 0.0 else thinnest_gap(rings)
     assert measured == pytest.approx(least_width(scene, threshold), rel=0.03)
+
+
+def test_no_filtered_design_falls_off_faster_than_a_straight_edge(rng):
+    scene = plate(2.0)
+    problem, spread = Problem(scene), scene.filter_spread
+    position = problem.particles.position[problem.particles.designed]
+    i, j = np.triu_indices(len(position), 1)
+    apart = np.hypot(*(position[i] - position[j]).T)
+    near = apart < 2.0 * spread
+    i, j, apart = i[near], j[near], apart[near]
+
+    def steepest(phi):
+        """Greatest slope of the Gaussian's inverse distribution of the filtered density."""
+        density = 0.5 * (1.0 + problem.chain.filter @ phi)
+        middle = (np.abs(density - 0.5) < 0.2)[[i, j]].all(axis=0)
+        values = ndtri(np.clip(density, 0.2, 0.8))
+        return spread * float((np.abs(values[i] - values[j]) / apart)[middle].max(initial=0.0))
+
+    for angle in rng.uniform(0.0, np.pi, 4):
+        across = (position - position.mean(axis=0)) @ (np.cos(angle), np.sin(angle))
+        assert steepest(np.sign(across)) == pytest.approx(1.0, abs=0.06)
+    for _ in range(20):
+        smooth = problem.chain.filter @ rng.normal(size=len(position))
+        for phi in (np.sign(smooth), rng.uniform(-1.0, 1.0, len(position))):
+            assert steepest(phi) <= 1.06
 
 
 def test_the_least_width_is_that_of_a_gaussian_and_needs_a_threshold():

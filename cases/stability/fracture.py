@@ -219,14 +219,13 @@ def measure(measured: Measured) -> Found:
         if (some := [b for b in whole if b["courant"] == courant and b["comes_back"]])
     )
     lost = [b for b in whole if not b["comes_back"]]
-    said = sorted({b["failure"].split(" (")[0].split(": ")[-1] for b in lost if b["failure"]})
+    why = sorted({b["failure"].split("; ")[0].split(": ")[-1] for b in lost if b["failure"]})
     found.lines.append(
         Line(
             "A bar that is pulled, total Lagrangian",
             "no fracture; stiffness grows with the stretch squared",
             f"comes back up to {borne}; {len(lost)} of {len(whole)} do not",
-            f"SimulationError: {', '.join(said) or 'none'}; `Problem` redoes it with half the step "
-            "beyond a Courant number of stretched solid of 1.",
+            f"SimulationError: {', '.join(why)}; `Problem` redoes it with half the step.",
         )
     )
     found.lines.append(

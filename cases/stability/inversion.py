@@ -260,8 +260,7 @@ def measure(measured: Measured) -> Found:
             + ", ".join(
                 f"up to {stretch:.1f} at Courant {courant:g}" for courant, stretch in most.items()
             ),
-            "SimulationError: a node is not a number; `Problem` redoes it with half the step "
-            "beyond a Courant number of stretched solid of 1.",
+            "SimulationError: a node is not a number; `Problem` redoes it with half the step.",
         )
     )
     return found

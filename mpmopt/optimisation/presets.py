@@ -34,34 +34,21 @@ def continuation(time_step: float | None = None, most_iterations: int = 25) -> S
     )
 
 
-def gait(time_step: float, most_iterations: int) -> Settings:
+def gait(most_iterations: int, move_limit: float = 0.02) -> Settings:
     """One stage of plain moving asymptotes with short moves, black and white from the first design.
 
     Its edges are as wide as a particle, so that no grey is there whose gain could be lost. Every
     design counts without it all the same, so the best is at least as good as the start, which is a
     drawing that strides. That needs contact layers, finite friction and viscosity, where distance
-    is smooth, and the total Lagrangian formulation, whose void may be light.
+    is smooth, and the total Lagrangian formulation, whose void may be light. A gait of several
+    actuators needs shorter moves.
     """
     return Settings(
-        (Stage(100.0, 2e-3, 2e-4, time_step, solid=True, move_limit=0.02, subpixel=True),),
+        (Stage(100.0, solid=True, move_limit=move_limit, subpixel=True),),
         adapt_move_limit=False,
         sharpen_asymptotes=False,
         asymptote_min=0.01,
         tolerance=0.0,
-        most_iterations=most_iterations,
-    )
-
-
-def creep(time_step: float, most_iterations: int) -> Settings:
-    """Beta doubled from 4 to 32, from a grey block, for bodies that walls bear on both sides.
-
-    Moves are shortened after a step that went back. At 16 and 32 designs are judged solid too.
-    """
-    return Settings(
-        tuple(
-            Stage(2.0**k, 2e-3, 2e-4, time_step, solid=k >= 4, move_limit=0.1) for k in range(2, 6)
-        ),
-        sharpen_asymptotes=False,
         most_iterations=most_iterations,
     )
 
