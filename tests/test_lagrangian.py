@@ -427,6 +427,9 @@ def test_a_look_sees_what_the_definitions_say(rng):
         hardening += (material.lame_lambda * log - material.lame_mu) * bend
         share = (stiffness / density)[solid]
         elastic = per_dx**2 * share * (material.lame_mu + np.maximum(hardening, 0.0) * s2)
+        within = scene.layers[0].line.distance(state[:2, solid])[0] < scene.layers[0].thickness
+        rising = scene.layers[0].stiffness / scene.layers[0].thickness
+        elastic += within * share * rising * (scene.time_step / 2.0) ** 2
         viscous = per_dx / scene.grid.dx * share * material.viscosity * s2
         courant = (viscous + np.sqrt(viscous**2 + elastic)).max()
         expected.append((courant, J.min(), *simulation.gap(kernels.grouped(state))))

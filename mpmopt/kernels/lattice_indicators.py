@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mpmopt.kernels.arrays import DEFORMATION, STATE_SIZE, at
+from mpmopt.kernels.arrays import DEFORMATION, POSITION, STATE_SIZE, at
 from mpmopt.kernels.compiler import bare_jit, loop_jit
 from mpmopt.kernels.lagrangian import but_touch, continued, make_rows, to_particles
+from mpmopt.kernels.layer import rise
 from mpmopt.kernels.material import solid_constants
 from mpmopt.kernels.overlap import closest
 from mpmopt.kernels.simd import load, real
@@ -39,20 +40,22 @@ def look(
     state = np.zeros((STATE_SIZE * len(solid), 4), states.dtype)
     for n in range(len(slots)):
         to_particles(states[slots[n]], lattice, number, rows, state)
-        found[n, 0], found[n, 1] = margins(state, solid, data, lattice.dt, lattice.dx)
+        found[n, 0], found[n, 1] = margins(state, solid, data, parameters)
         found[n, 2], found[n, 3], found[n, 4] = closest(state, reference, solid, data, parameters)
 
 
 @bare_jit
-def margins(state, solid, data, dt, dx):
+def margins(state, solid, data, parameters):
     """Largest Courant number k_v + sqrt(k_v^2 + k_e^2) and smallest J of solid.
 
     Void, which is crushed and turned inside out, moves with the solid around it.
 
     Against dF = a N, a wave along N, the tangent of `lagrangian.solid_stress` has the stiffness
     M = mu + h' s^2 with h = (lambda ln J - mu) (ln J)' and the larger stretch s; its viscosity is
-    eta s^2. k_e^2 = (dt / dx)^2 M / rho, k_v = dt / dx^2 eta s^2 / rho.
+    eta s^2. k_e^2 = (dt / dx)^2 M / rho, k_v = dt / dx^2 eta s^2 / rho. Within layers of ground
+    k_e^2 has more, as in `indicators`.
     """
+    dt, dx = parameters.dt, parameters.dx
     courant, smallest = 0.0, math.inf
     step = dt / dx
     for g in range(len(solid)):
@@ -69,6 +72,10 @@ def margins(state, solid, data, dt, dx):
                 s2 = 0.5 * (trace[k] + apart)
                 specific = data.stiffness[g, k].real * data.volume[g, k].real / data.mass[g, k].real
                 elastic = step * step * (mu[k] + max(hardening[k], 0.0) * s2) * specific
+                if len(parameters.ground.layers):
+                    x = state[at(g, POSITION), k].real
+                    y = state[at(g, POSITION + 1), k].real
+                    elastic += 0.25 * dt * dt * specific * rise(x, y, parameters)
                 viscous = step / dx * eta[k] * s2 * specific
                 courant = max(courant, viscous + math.sqrt(viscous * viscous + elastic))
                 smallest = min(smallest, J[k])
