@@ -134,7 +134,7 @@ def test_what_moves_alike_keeps_its_lists_but_not_those_of_images(rng):
         touch, nodes = half.lattice.touch, half.start.copy()
         near, seen = pairs.nowhere(touch), 0
         for _ in range(8):
-            nodes[half.scene.mirror.normal] += 0.45 * C
+            nodes[mirror.normal] += 0.45 * C
             near, _ = pairs.renewed(near, nodes, touch)
             force, expected = np.zeros_like(nodes), by_hand(half, nodes)
             pairs.push_apart(near, nodes, touch, force)
