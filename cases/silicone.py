@@ -30,7 +30,7 @@ DETUNING = 0.25
 TIME_STEP = 5e-5  # s
 
 
-def silicone_walker(seconds: float = 0.35) -> Scene:
+def silicone_walker(seconds: float = 0.4) -> Scene:
     """The walker's body on cells of 3 mm; what comes in the first 0.1 s does not count."""
 
     def at(x: int, y: int) -> tuple[float, float]:
@@ -74,12 +74,16 @@ def start(positions: np.ndarray) -> np.ndarray:
 
 START = {"phi": start, "a": 1.0, "theta": 0.7, "b": -0.2, "omega": 0.3}
 
-# The walker's, in metres.
-TASK = replace(walker.TASK, soft_minimum=walker.TASK.soft_minimum / (64 * CELL))
+# The walker's in metres, without thinner and thicker designs, which do not stride at one frequency.
+TASK = replace(
+    walker.TASK,
+    scenes=tuple(replace(each, threshold=0.5) for each in walker.TASK.scenes),
+    soft_minimum=walker.TASK.soft_minimum / (64 * CELL),
+)
 
 CASES = {
-    "default": Case(silicone_walker(0.5), gait(120), two_legs, START, TASK),
-    "preview": Case(silicone_walker(), gait(40), two_legs, START, TASK),
+    "default": Case(silicone_walker(0.5), gait(120, 0.01), two_legs, START, TASK),
+    "preview": Case(silicone_walker(), gait(40, 0.01), two_legs, START, TASK),
 }
 
 if __name__ == "__main__":
