@@ -134,9 +134,8 @@ def on_ground(
     return simulation, Objective.of(problem.scene, simulation.particles)
 
 
-def several(scenes: int, simulation: Simulation, objective: Objective) -> Run:
-    """So many gradients side by side, each by one thread."""
-    run = partial(gradient_of, simulation, objective, KEEP_ALL)
+def several(scenes: int, run: Run) -> Run:
+    """So many side by side, each by one thread."""
     return with_threads(1, lambda: side_by_side(lambda _: run(), range(scenes)))
 
 
@@ -148,8 +147,9 @@ def formulations(steps: int, rounds: int) -> str:
         simulation, objective = on_ground(128, steps, kind)
         count = simulation.initial.shape[1]
         runs[f"forward {kind}"] = with_threads(1, simulation.run)
-        runs[f"both {kind}"] = several(1, simulation, objective)
-        runs[f"two {kind}"] = several(2, simulation, objective)
+        gradient = partial(gradient_of, simulation, objective, KEEP_ALL)
+        runs[f"both {kind}"] = several(1, gradient)
+        runs[f"two {kind}"] = several(2, gradient)
     seconds = in_turns(runs, rounds)
     rows = []
     for what, number, name in (
@@ -183,7 +183,10 @@ def sizes_on_ground(quick: bool, rounds: int) -> str:
         simulation, objective = on_ground(cells, steps)
         count = simulation.initial.shape[1]
         seconds = in_turns(
-            {"forward": with_threads(1, simulation.run), "both": several(1, simulation, objective)},
+            {
+                "forward": with_threads(1, simulation.run),
+                "both": several(1, partial(gradient_of, simulation, objective, KEEP_ALL)),
+            },
             rounds,
         )
         per = 1e9 / (count * steps)
@@ -236,26 +239,37 @@ def sizes(quick: bool, rounds: int) -> str:
     return table("Value + gradient by size", header, rows)
 
 
+def first_steps(formulation: Formulation, began: float) -> None:
+    """In the processes of `start_up`: print when the first step and the first gradient are done."""
+    problem, x = problem_of(64, 1)
+    if formulation == "total":
+        problem = Problem(replace(walker_on_ground(64, 4e-4, 4.0), steps=1, transient=0.0))
+        x = problem.join(0.0, 1.0, -0.3, -0.5)
+    problem.value(x)
+    first = time.perf_counter() - began
+    problem.value_and_gradient(x)
+    print(first, time.perf_counter() - began)
+
+
 def start_up() -> str:
     """Seconds to the first time step and to the first gradient, with an empty and a full cache."""
     program = (
         "import sys, time; began = time.perf_counter(); sys.path.insert(0, sys.argv[1])\n"
-        "from benchmark import problem_of\n"
-        "problem, x = problem_of(64, 1)\n"
-        "problem.value(x); first = time.perf_counter() - began\n"
-        "problem.value_and_gradient(x); print(first, time.perf_counter() - began)\n"
+        "from benchmark import first_steps\n"
+        "first_steps(sys.argv[2], began)\n"
     )
     rows = []
     with tempfile.TemporaryDirectory() as cache:
         for name in ("first start: compiling", "later start"):
-            done = subprocess.run(
-                [sys.executable, "-c", program, str(Path(__file__).parent)],
-                env={**os.environ, "NUMBA_CACHE_DIR": cache},
-                capture_output=True, text=True, check=True,
-            )  # fmt: skip
-            step, gradient = map(float, done.stdout.split())
-            rows.append([name, f"{step:.1f}", f"{gradient:.1f}"])
-    header = ["", "s to the first time step", "s to the first gradient"]
+            for formulation in ("updated", "total"):
+                done = subprocess.run(
+                    [sys.executable, "-c", program, str(Path(__file__).parent), formulation],
+                    env={**os.environ, "NUMBA_CACHE_DIR": f"{cache}/{formulation}"},
+                    capture_output=True, text=True, check=True,
+                )  # fmt: skip
+                step, gradient = map(float, done.stdout.split())
+                rows.append([name, formulation, f"{step:.1f}", f"{gradient:.1f}"])
+    header = ["", "formulation", "s to the first time step", "s to the first gradient"]
     return table("From the interpreter's start", header, rows)
 
 
@@ -295,6 +309,9 @@ def peers(steps: int, rounds: int) -> str:
         "mpmopt forward": with_threads(2, simulation.run),
         "mpmopt": with_threads(2, lambda: gradient_of(simulation, objective, Checkpointing())),
     }
+    lattice, of_lattice = on_ground(128, steps)
+    ensemble = partial(gradient_of, lattice, of_lattice, KEEP_ALL)
+    runs |= {"ensemble forward": several(2, lattice.run), "ensemble": several(2, ensemble)}
     found = {}
     for module, package in PEERS.items():
         peer = importlib.import_module(f"peers.{module}")
@@ -324,6 +341,20 @@ def peers(steps: int, rounds: int) -> str:
                 f"{max(apart.values()):.0e}" if apart else "",
             ]
         )
+    two = 2.0 * lattice.initial.shape[1] / simulation.initial.shape[1]  # as many particles
+    times = [seconds[name] / two for name in ("ensemble forward", "ensemble")]
+    rows.insert(
+        1,
+        [
+            "mpmopt, total Lagrangian on ground, two scenes side by side",
+            f"{np.median(times[0]) * per:.0f}",
+            f"{ratio(times[0], seconds['mpmopt forward']):.1f}",
+            f"{np.median(times[1]) * per:.0f}",
+            f"{ratio(times[1], seconds['mpmopt']):.1f}",
+            "",
+            "",
+        ],
+    )
     header = [
         "program", "forward ns", "times ours", "value + gradient ns", "times ours", "peak MB",
         "differs by",
@@ -361,6 +392,7 @@ def main() -> int:
         threads_and_schedules(arguments.steps, rounds),
         formulations(arguments.steps, rounds),
         sizes(arguments.quick, 3),
+        sizes_on_ground(arguments.quick, 3),
         start_up(),
         f"Peak memory of one gradient at 5000 steps: {peak_memory('mpmopt', 5000):.0f} MB.\n",
     ]
