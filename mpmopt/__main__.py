@@ -299,6 +299,7 @@ def cheapest(path: Path, tol: float, gradient_tol: float | None, seconds: float)
             run.result.x,
             tol,
             beta=problem.chain.beta,
+            subpixel=problem.chain.subpixel,
             void_cutoff=problem.void_cutoff,
             task=problem.task,
             gradient_tolerance=gradient_tol,

@@ -9,6 +9,7 @@ import pytest
 from conftest import small_scene
 from walker import walker
 
+from mpmopt.assess.discretisation import Discretisation, measure
 from mpmopt.design.chain import (
     DesignChain,
     filter_matrix,
@@ -266,3 +267,24 @@ def test_the_adjoint_of_the_subpixel_projection_is_its_complex_step(beta, thresh
     moved = project_subpixel(field + 1e-30j * direction, beta, threshold, differences)
     phi_bar = project_subpixel_adjoint(field, beta, bar, threshold, differences)
     assert direction @ phi_bar == pytest.approx(bar @ moved.imag / 1e-30, rel=1e-12)
+
+
+def test_a_subpixel_design_is_measured_as_such_in_other_discretisations():
+    scene = small_scene(steps=4)
+    particles, field = field_of(scene, lambda x, y: 0.02 * (x - 3.3))
+    plain, subpixel = (
+        measure(
+            scene,
+            Discretisation.of(scene),
+            lambda problem: problem.join(field, 0.5, 0.0, 0.0),
+            2.0,
+            scene.grid.dx,
+            subpixel=whether,
+        )
+        for whether in (False, True)
+    )
+    assert not plain.failure and not subpixel.failure
+    problems = [Problem(scene, 2.0, subpixel=whether) for whether in (False, True)]
+    own, other = (problem.value(problem.join(field, 0.5, 0.0, 0.0)) for problem in problems)
+    assert own != other
+    assert subpixel.travel - plain.travel == pytest.approx(other - own, abs=1e-14)

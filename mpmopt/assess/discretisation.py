@@ -230,6 +230,7 @@ def measure(
     beta: float,
     patch: float,
     *,
+    subpixel: bool = False,
     void_cutoff: float = 0.0,
     checkpointing: Checkpointing | None = None,
     limits: Indicators | None = None,
@@ -244,7 +245,7 @@ def measure(
     discretisation : Discretisation
     design : callable
         From a `Problem` to its variables.
-    beta, void_cutoff, checkpointing, limits
+    beta, subpixel, void_cutoff, checkpointing, limits
         As in `Problem`, whose step is never halved here.
     patch : float
         Width of the squares over which the gradient is summed (`density`).
@@ -265,6 +266,7 @@ def measure(
             scene,
             beta,
             task=task,
+            subpixel=subpixel,
             void_cutoff=void_cutoff,
             checkpointing=checkpointing,
             halvings=0,
@@ -437,6 +439,7 @@ def cheapest(
     tolerance: float,
     *,
     beta: float = 1.0,
+    subpixel: bool = False,
     void_cutoff: float = 0.0,
     gradient_tolerance: float | None = None,
     seconds: float = 60.0,
@@ -461,7 +464,7 @@ def cheapest(
         Variables of the scene's own `Problem`, or a function from any `Problem` to its variables.
     tolerance : float
         Relative, of the distance travelled and of the gradient as a density.
-    beta, void_cutoff : float, optional
+    beta, subpixel, void_cutoff : optional
         As in `Problem`.
     gradient_tolerance : float, optional
         Another tolerance for the gradient; infinity leaves it out.
@@ -487,8 +490,11 @@ def cheapest(
         "gradient_tolerance", tolerance if gradient_tolerance is None else gradient_tolerance
     )
     seconds = _limit("seconds", seconds)
+    options: dict[str, Any] = {
+        "subpixel": subpixel, "void_cutoff": void_cutoff, "limits": LIMITS, "task": task
+    }  # fmt: skip
     if not callable(design):
-        design = carried(Problem(scene, beta, void_cutoff=void_cutoff), design)
+        design = carried(Problem(scene, beta), design)
     # Half a body is the same solution, but another objective may not be symmetric.
     plane = symmetry(scene, design, beta) if task == DEFAULT_TASK else scene.mirror
     scene = replace(scene, filter_length=filter_reach(scene))
@@ -498,9 +504,7 @@ def cheapest(
 
     def result(item: Discretisation) -> Measured:
         if item not in found:
-            found[item] = measure(
-                scene, item, design, beta, patch, void_cutoff=void_cutoff, limits=LIMITS, task=task
-            )
+            found[item] = measure(scene, item, design, beta, patch, **options)
         return found[item]
 
     own = Discretisation.of(scene, mirror=plane)

@@ -146,6 +146,7 @@ class DesignChain:
         self.beta = number("DesignChain", "beta", beta, above=0.0, error=DesignError)
         self.threshold = 0.5
         self.filter = filter_matrix(scene, particles)
+        self.subpixel = subpixel
         self.differences = lattice_differences(scene, particles) if subpixel else []
         self.from_own: NDArray[np.int64] | None = None
         self.designed = particles.designed
@@ -185,7 +186,7 @@ class DesignChain:
 
     def _projected(self, filtered: NDArray) -> NDArray:
         """gamma of the design particles."""
-        if self.differences:
+        if self.subpixel:
             gamma = project_subpixel(filtered, self.beta, self.threshold, self.differences)
         else:
             gamma = project(filtered, self.beta, self.threshold)
@@ -197,7 +198,7 @@ class DesignChain:
             own_bar = np.zeros(filtered.shape, gamma_bar.dtype)
             np.add.at(own_bar, self.from_own, gamma_bar)
             gamma_bar = own_bar
-        if self.differences:
+        if self.subpixel:
             return project_subpixel_adjoint(
                 filtered, self.beta, gamma_bar, self.threshold, self.differences
             )
