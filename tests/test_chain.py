@@ -271,7 +271,7 @@ def test_the_adjoint_of_the_subpixel_projection_is_its_complex_step(beta, thresh
 
 def test_a_subpixel_design_is_measured_as_such_in_other_discretisations():
     scene = small_scene(steps=4)
-    particles, field = field_of(scene, lambda x, y: 0.02 * (x - 3.3))
+    _, field = field_of(scene, lambda x, y: 0.02 * (x - 3.3))
     plain, subpixel = (
         measure(
             scene,
