@@ -134,9 +134,9 @@ def on_ground(
     return simulation, Objective.of(problem.scene, simulation.particles)
 
 
-def several(scenes: int, run: Run) -> Run:
-    """So many side by side, each by one thread."""
-    return with_threads(1, lambda: side_by_side(lambda _: run(), range(scenes)))
+def several(*runs: Run) -> Run:
+    """Runs side by side, each by one thread; each needs a simulation of its own."""
+    return with_threads(1, lambda: side_by_side(lambda run: run(), runs))
 
 
 def formulations(steps: int, rounds: int) -> str:
@@ -147,9 +147,12 @@ def formulations(steps: int, rounds: int) -> str:
         simulation, objective = on_ground(128, steps, kind)
         count = simulation.initial.shape[1]
         runs[f"forward {kind}"] = with_threads(1, simulation.run)
-        gradient = partial(gradient_of, simulation, objective, KEEP_ALL)
-        runs[f"both {kind}"] = several(1, gradient)
-        runs[f"two {kind}"] = several(2, gradient)
+        gradients = [
+            partial(gradient_of, *pair, KEEP_ALL)
+            for pair in ((simulation, objective), on_ground(128, steps, kind))
+        ]
+        runs[f"both {kind}"] = several(gradients[0])
+        runs[f"two {kind}"] = several(*gradients)
     seconds = in_turns(runs, rounds)
     rows = []
     for what, number, name in (
@@ -185,7 +188,7 @@ def sizes_on_ground(quick: bool, rounds: int) -> str:
         seconds = in_turns(
             {
                 "forward": with_threads(1, simulation.run),
-                "both": several(1, partial(gradient_of, simulation, objective, KEEP_ALL)),
+                "both": several(partial(gradient_of, simulation, objective, KEEP_ALL)),
             },
             rounds,
         )
@@ -309,9 +312,12 @@ def peers(steps: int, rounds: int) -> str:
         "mpmopt forward": with_threads(2, simulation.run),
         "mpmopt": with_threads(2, lambda: gradient_of(simulation, objective, Checkpointing())),
     }
-    lattice, of_lattice = on_ground(128, steps)
-    ensemble = partial(gradient_of, lattice, of_lattice, KEEP_ALL)
-    runs |= {"ensemble forward": several(2, lattice.run), "ensemble": several(2, ensemble)}
+    pairs = [on_ground(128, steps) for _ in range(2)]
+    lattice = pairs[0][0]
+    runs |= {
+        "ensemble forward": several(*(each.run for each, _ in pairs)),
+        "ensemble": several(*(partial(gradient_of, *pair, KEEP_ALL) for pair in pairs)),
+    }
     found = {}
     for module, package in PEERS.items():
         peer = importlib.import_module(f"peers.{module}")

@@ -23,7 +23,7 @@ from mpmopt.app.sweeps import as_csv
 from mpmopt.assess.robustness import Robot, Trial, speed
 from mpmopt.design.task import Task
 from mpmopt.design.variation import Variation
-from mpmopt.errors import SceneError, SimulationError
+from mpmopt.errors import SceneError, SimulationError, StorageError
 from mpmopt.io.console import reported
 from mpmopt.io.files import make_folder, replace_file
 from mpmopt.io.progress import Progress
@@ -83,6 +83,8 @@ def finished(path: Path, settings: Settings, task: Task, seed: int) -> Optimisat
     """The run, once it has ended; it is in a file all the time."""
     if path.exists():
         run = runfile.read_run(path).run
+        if (run.scene, run.settings, run.task) != (CASE.scene, settings, task):
+            raise StorageError(f"{path} holds another scene, settings or task; take another --out")
     else:
         run = begin(CASE.scene, settings, start_of(seed), task)
     if not run.stop_reason:

@@ -2,7 +2,7 @@
 
     python cases/terrain.py --preview --out DIR
 
-Hollows are up to two cells deep, that is more than a quarter of a leg's height. What it is judged
+Hollows are up to a cell deep, that is a seventh of a leg's height. What it is judged
 on is a fourth ground, which no scene of the optimisation has. `slope` and `step` are other shapes.
 """
 

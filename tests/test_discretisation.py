@@ -18,7 +18,6 @@ from mpmopt.assess.discretisation import (
     Measured,
     cheapest,
     density,
-    filter_reach,
     measure,
     symmetry,
 )
@@ -213,11 +212,11 @@ def test_what_makes_no_sense_is_refused():
 
 def test_the_filter_keeps_its_length_on_other_grids():
     scene = walker(64, 8e-4)
-    reach = filter_reach(scene)
+    reach = scene.filter_spread
     kept = replace(scene, filter_length=reach)
     assert kept.filter_passes == 1
     fine = Discretisation.of(kept, 2.0).scene(kept)
-    assert filter_reach(fine) == pytest.approx(reach, rel=0.02)
+    assert fine.filter_spread == pytest.approx(reach, rel=0.02)
 
 
 def test_the_command_prints_evidence_and_what_it_found(tmp_path, capsys):

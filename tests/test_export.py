@@ -18,10 +18,10 @@ from scipy.ndimage import label
 from scipy.spatial import KDTree
 from vtkmodules.util.numpy_support import vtk_to_numpy
 from vtkmodules.vtkIOHDF import vtkHDFReader
-from walker import walker
+from walker import CASES, walker
 
 from mpmopt.__main__ import main
-from mpmopt.assess.threshold import pieces, solid_body
+from mpmopt.assess.threshold import kept, pieces, solid_body
 from mpmopt.design.problem import Problem
 from mpmopt.design.task import DEFAULT_TASK
 from mpmopt.errors import (
@@ -108,6 +108,18 @@ def test_the_outline_passes_between_particles_that_stay_and_particles_that_go(ho
         points = problem.particles.position[clear]
         inside = np.any([polygon.contains(points) for polygon in outline(problem, x, threshold)], 0)
         assert np.array_equal(inside, gamma[clear] >= threshold)
+
+
+@pytest.mark.parametrize("threshold", [0.3, 0.5, 0.7])
+def test_the_outline_of_a_subpixel_design_parts_the_same_particles(threshold):
+    problem = Problem(CASES["preview"].scene, 100.0, subpixel=True)
+    x = problem.join(**CASES["preview"].start)
+    there = np.ones(len(problem.particles.position), dtype=bool)
+    there[problem.particles.designed] = kept(problem, x, threshold)
+    assert 0.2 < there.mean() < 0.9
+    points = problem.particles.position
+    inside = np.any([polygon.contains(points) for polygon in outline(problem, x, threshold)], 0)
+    assert np.array_equal(inside, there)
 
 
 def test_a_solid_reference_design_is_its_rectangle_and_an_empty_one_what_is_solid():

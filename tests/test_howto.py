@@ -41,8 +41,7 @@ def run_page(monkeypatch, tmp_path):
     coarse: Any = ModuleType("robot")
     coarse.worm = replace(worm, grid=Grid((64, 16), 1 / 32), time_step=2e-3, steps=500)
     monkeypatch.setitem(sys.modules, "robot", coarse)
-    for name in ("continuation", "creep"):
-        monkeypatch.setattr(presets, name, few)
+    monkeypatch.setattr(presets, "continuation", few)
     monkeypatch.chdir(tmp_path)
 
     def run(page: str) -> dict[str, Any]:

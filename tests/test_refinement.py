@@ -78,6 +78,12 @@ def test_a_step_over_the_stability_limit_is_left_out():
             assert longer.steps == there.steps // 2
 
 
+def test_an_odd_number_of_steps_can_be_halved_as_well():
+    longer = with_twice_the_step(small_scene(time_step=1e-3, steps=501))
+    assert longer is not None
+    assert (longer.time_step, longer.steps) == (2e-3, 251)
+
+
 def test_what_cannot_be_simulated_says_why(monkeypatch):
     problem = Problem(small_scene())
     real = refinement.distance

@@ -160,6 +160,12 @@ def test_a_signal_that_a_library_swallows_is_not_lost(capfd):
     assert capfd.readouterr().err == ""
 
 
+def test_a_signal_that_a_library_swallows_counts_if_the_work_ends_at_once(capfd):
+    with pytest.raises(Interrupted, match="SIGTERM"), interruptible():
+        callback()
+    assert capfd.readouterr().err == ""
+
+
 @pytest.mark.process
 def test_a_signal_ends_going_on_too_and_says_how_to_go_on(whole, tmp_path):
     process = faults.Process(tmp_path / "out")

@@ -55,7 +55,10 @@ def main(description: str, cases: Mapping[str, Case], argv: list[str] | None = N
         help="simulate it so: updated is MLS-MPM, total is total Lagrangian",
     )
     parser.add_argument(
-        "--starts", type=int, metavar="N", help="optimise from N starts, all but one random"
+        "--starts",
+        type=int,
+        metavar="N",
+        help="optimise from N starts, all but one with a random field added",
     )
     parser.add_argument(
         "--scheduler", metavar="ADDRESS", help="run the starts on this Dask cluster"

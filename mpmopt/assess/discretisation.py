@@ -497,7 +497,7 @@ def cheapest(
         design = carried(Problem(scene, beta), design)
     # Half a body is the same solution, but another objective may not be symmetric.
     plane = symmetry(scene, design, beta) if task == DEFAULT_TASK else scene.mirror
-    scene = replace(scene, filter_length=filter_reach(scene))
+    scene = replace(scene, filter_length=scene.filter_spread)
     grid = _candidates(scene, plane)
     patch = max(scene.grid.size[0] / item.cells[0] for item in grid.values())
     found: dict[Discretisation, Measured] = {}
@@ -605,12 +605,6 @@ def _limit(name: str, value: Any) -> float:
     if isinstance(value, float) and value == math.inf:
         return math.inf
     return number("cheapest", name, value, above=0.0, error=DesignError)
-
-
-def filter_reach(scene: Scene) -> float:
-    """Standard deviation that the scene's filter has, as `Scene.filter_length` counts it."""
-    _, w1, w2 = scene.filter_weights
-    return scene.grid.dx * math.sqrt(0.5 + 2.0 * (w1 + 2.0 * w2) * scene.filter_passes)
 
 
 def _candidates(scene: Scene, plane: Mirror | None) -> dict[Key, Discretisation]:

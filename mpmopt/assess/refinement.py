@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -94,10 +95,9 @@ def with_twice_the_step(scene: Scene) -> Scene | None:
 
     Most robots are designed with more than half of the longest stable step.
     """
-    try:
-        return scene.vary(time_step=scene.time_step * 2.0)
-    except SceneError:
+    if 2.0 * scene.time_step > scene.largest_time_step:
         return None
+    return replace(scene, time_step=2.0 * scene.time_step, steps=math.ceil(scene.steps / 2))
 
 
 def other_formulation(scene: Scene) -> Formulation:

@@ -366,15 +366,14 @@ def study(
     -------
     dict
         ``speed``; ``speed_by_friction``, and where it is full ``speed_by_strength``,
-        ``speed_by_frequency``, ``speed_by_step`` (times the run's,
-        as far as it is stable) and, of both formulations,
-        ``speed_by_cells`` (along the grid's shorter side), by numbers as text; ``kept``, shares of
-        the speed with half the step, with cells half as wide, and where it is full a quarter as
-        wide, and half as wide in the other formulation; ``driven_share``, what is missing when the
-        actuation is held; ``after_push``, the share of the speed that it has after a push;
-        ``followed``, how long it goes on and what ends it; ``components``, before loose pieces are
-        dropped; and ``failures``, why a number is None. Only the components where there is no
-        ground or no actuator.
+        ``speed_by_frequency``, ``speed_by_step`` (times the run's, as far as it is stable) and, of
+        both formulations, ``speed_by_cells`` (along the grid's shorter side), by numbers as text;
+        ``kept``, shares of the speed with half the step, with cells half as wide, and where it is
+        full a quarter as wide, and half as wide in the other formulation; ``driven_share``, what is
+        missing when the actuation is held; ``after_push``, the share of the speed that it has after
+        a push; ``followed``, how long it goes on and what ends it; ``components``, before loose
+        pieces are dropped; and ``failures``, why a number is None. Only the components where there
+        is no ground or no actuator.
 
     Raises
     ------

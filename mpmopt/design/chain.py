@@ -127,7 +127,8 @@ class DesignChain:
     beta : float
         Sharpness of the projection, > 0.
     subpixel : bool, optional
-        Whether edges are as wide as a particle, whatever beta is (`projection.project_subpixel`).
+        Whether edges are at least as wide as a particle, however large beta is
+        (`projection.project_subpixel`).
 
     Attributes
     ----------

@@ -57,7 +57,7 @@ class Problem:
     task : Task, optional
         Objective, constraints and scenes; default: the displacement in this one.
     subpixel : bool, optional
-        Whether edges of the design are as wide as a particle, whatever beta is
+        Whether edges of the design are at least as wide as a particle, however large beta is
         (`projection.project_subpixel`).
 
     Attributes

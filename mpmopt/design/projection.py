@@ -1,8 +1,8 @@
 """From a filtered design to material density: smoothed Heaviside functions, and the way back.
 
-The plain one is as wide as beta says, on the scale of the design. The subpixel one is as wide as a
-particle, in space, however slowly the design varies, so that it is black and white everywhere else
-and still has a gradient all along its edges (SSP2: Romano, Arrieta and Johnson, arXiv:2601.10737;
+The plain one is as wide as beta says, on the scale of the design. The subpixel one is at least as
+wide as a particle, in space: with a large beta it is black and white everywhere else, and still has
+a gradient all along the edges of a design (SSP2: Romano, Arrieta and Johnson, arXiv:2601.10737;
 after Hammond et al., arXiv:2503.20189).
 """
 
@@ -49,18 +49,20 @@ def _edges(beta: float, threshold: float) -> tuple[float, float, float]:
 
 
 def lattice_differences(scene: Scene, particles: Particles) -> list[scipy.sparse.csr_array]:
-    """Matrices (D, D) of d/dx, d/dy, and R d2/dx2, R d2/dy2, sqrt(2) R d2/dxdy, per spacing.
+    """Matrices (D, D) of d/dx, d/dy, and R d2/dx2, R d2/dy2, sqrt(2) R d2/dxdy, in spacings.
 
     They are between the D design particles of a scene and their neighbours, across a mirror too.
-    Where one neighbour is missing, the difference is one-sided and the curvature zero.
+    Where one neighbour along an axis is missing, the first difference is one-sided and the second
+    along that axis zero.
     """
     body = discretise(scene, whole=True)
     half, whole = particles.subset(particles.designed), body.subset(body.designed)
     image = mirror_images(scene, half, whole)
     site = np.floor(whole.position * (scene.particles_per_cell / scene.grid.dx)).astype(np.int64)
-    site -= site.min(axis=0, initial=0) - 1
+    site += 1  # with a margin of empty sites
     number = np.full(site.max(axis=0, initial=0) + 2, -1)
-    number[tuple(site.T)] = here = np.arange(len(site))
+    here = np.arange(len(site))
+    number[tuple(site.T)] = here
 
     def matrix(column: NDArray, values: NDArray) -> scipy.sparse.csr_array:
         return scipy.sparse.csr_array((values, (here, column)), shape=(here.size, here.size))
@@ -93,7 +95,7 @@ def project_subpixel(
     F(s) rises from 0 to 1 between the distances s = -1 and 1 from the edge, in half widths;
     s = (phi - phi_0) / (R n), n^2 = |grad phi|^2 + R^2 |grad grad phi|^2, phi_0 the threshold.
     """
-    reach, F = _edge(phi, threshold, differences)
+    reach, _, F = _edge(phi, threshold, differences)
     low, high = (
         project(each, beta, threshold) for each in (phi - reach * F, phi + reach * (1 - F))
     )
@@ -108,14 +110,13 @@ def project_subpixel_adjoint(
     differences: list[scipy.sparse.csr_array],
 ) -> NDArray:
     """phi_bar from gamma_bar."""
-    reach, F = _edge(phi, threshold, differences)
+    reach, s, F = _edge(phi, threshold, differences)
     low, high = phi - reach * F, phi + reach * (1.0 - F)
     low_bar = project_adjoint(low, beta, (1.0 - F) * gamma_bar, threshold)
     high_bar = project_adjoint(high, beta, F * gamma_bar, threshold)
     jump = project(high, beta, threshold) - project(low, beta, threshold)
     F_bar = gamma_bar * jump - reach * (low_bar + high_bar)
-    s = (phi - (2.0 * threshold - 1.0)) / reach
-    s_bar = F_bar * np.where(np.abs(s) < 1.0, 0.9375 * (1.0 - s**2) ** 2, 0.0)
+    s_bar = 0.9375 * (1.0 - s**2) ** 2 * F_bar
     reach_bar = (1.0 - F) * high_bar - F * low_bar - s_bar * s / reach
     phi_bar = low_bar + high_bar + s_bar / reach
     for difference in differences:
@@ -125,10 +126,23 @@ def project_subpixel_adjoint(
 
 def _edge(
     phi: NDArray, threshold: float, differences: list[scipy.sparse.csr_array]
-) -> tuple[NDArray, NDArray]:
-    """R n, and F of where phi is."""
+) -> tuple[NDArray, NDArray, NDArray]:
+    """R n, s within [-1, 1], and F."""
     squares = sum((difference @ phi) ** 2 for difference in differences)
     reach = REACH * np.sqrt(squares + LEAST_SLOPE**2)
     s = (phi - (2.0 * threshold - 1.0)) / reach
     s = np.where(np.abs(s.real) < 1.0, s, np.sign(s.real))
-    return reach, 0.5 + 0.0625 * s * (15.0 - 10.0 * s**2 + 3.0 * s**4)
+    return reach, s, 0.5 + 0.0625 * s * (15.0 - 10.0 * s**2 + 3.0 * s**4)
+
+
+def half_width(
+    phi: NDArray, threshold: float, differences: list[scipy.sparse.csr_array]
+) -> NDArray:
+    """R n of `project_subpixel`: half the width of an edge, on the scale of phi."""
+    return _edge(phi, threshold, differences)[0]
+
+
+def edge_at(gamma: float) -> float:
+    """The s at which F is gamma."""
+    s = np.linspace(-1.0, 1.0, 20001)
+    return float(np.interp(gamma, 0.5 + 0.0625 * s * (15.0 - 10.0 * s**2 + 3.0 * s**4), s))

@@ -60,7 +60,7 @@ def interruptible() -> Iterator[None]:
         if not isinstance(what.exc_value, Interrupted):
             complain(what)
             return
-        # Raised in a library's callback, where nothing can be; a moment later it can.
+        # A library's callback swallowed it. It is raised again a moment later.
         for each in SIGNALS:
             signal.signal(each, raise_it)
         main = threading.main_thread().ident
@@ -78,9 +78,13 @@ def interruptible() -> Iterator[None]:
         if heard:
             raise Interrupted(heard[0]) from error
         raise
+    else:
+        if heard:  # and swallowed, and the work ended before it could be raised again
+            raise Interrupted(heard[0])
     finally:
         for timer in again:
             timer.cancel()
+            timer.join()
         sys.unraisablehook = complain
         for number, handler in handlers.items():
             signal.signal(number, handler)

@@ -39,9 +39,9 @@ def gait(most_iterations: int, move_limit: float = 0.02) -> Settings:
 
     Its edges are as wide as a particle, so that no grey is there whose gain could be lost. Every
     design counts without it all the same, so the best is at least as good as the start, which is a
-    drawing that strides. That needs contact layers, finite friction and viscosity, where distance
-    is smooth, and the total Lagrangian formulation, whose void may be light. A gait of several
-    actuators needs shorter moves.
+    drawing that strides. It needs contact layers, finite friction and viscosity, with which
+    distance is smooth. It also needs the total Lagrangian formulation, whose void may be light. A
+    gait of several actuators needs shorter moves.
     """
     return Settings(
         (Stage(100.0, solid=True, move_limit=move_limit, subpixel=True),),

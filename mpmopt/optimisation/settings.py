@@ -64,8 +64,8 @@ class Stage:
         Whether an evaluation that goes beyond `step_control.LIMITS` is rejected too, or only one
         that fails.
     subpixel : bool
-        Whether edges of the design are as wide as a particle, and the rest is black and white,
-        whatever beta is (`projection.project_subpixel`).
+        Whether edges of the design are at least as wide as a particle, however large beta is
+        (`projection.project_subpixel`); with a large one, such as 100, the rest is black and white.
 
     Raises
     ------
@@ -130,7 +130,7 @@ class Stage:
 
 
 # A short continuation for any scene; the last stage counts designs without their void.
-STAGES = (Stage(1.0), Stage(4.0), Stage(16.0, solid=True))
+STAGES = (Stage(1.0), Stage(4.0), Stage(16.0, solid=True, void_cutoff=0.05))
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from mpmopt.assess.threshold import THRESHOLD, kept
 from mpmopt.design.chain import filter_matrix
 from mpmopt.design.problem import Problem
+from mpmopt.design.projection import edge_at, half_width
 from mpmopt.scene.particles import discretise, mirror_images
 
 # The filtered design is sampled at so many intervals per particle spacing.
@@ -70,7 +71,9 @@ def outline(
 
     Gamma is a monotonic function of the filtered design, and this a smooth function of position,
     not of particles only. So the outline is one of its level lines, which passes between particles
-    that stay and particles that go. At the edges of regions it is cut straight. What holds no
+    that stay and particles that go. With a subpixel projection gamma depends on slopes too: then it
+    is the line of the mean slope of edges, and the few particles on its wrong side are drawn or cut
+    out with their squares. At the edges of regions it is cut straight. What holds no
     particle is not drawn. Nothing hangs together by a point, and no two edges touch: where corners
     of the body would meet, they are cut by less than a hundredth of a particle's spacing.
 
@@ -98,8 +101,15 @@ def outline(
     """
     solid = kept(problem, x, threshold)
     drawn = solid if keep is None else solid & keep
-    phi, beta = problem.split(x).phi, problem.chain.beta
-    level = np.arctanh((2.0 * threshold - 1.0) * np.tanh(beta)) / beta
+    phi, chain = problem.split(x).phi, problem.chain
+    level = np.arctanh((2.0 * threshold - 1.0) * np.tanh(chain.beta)) / chain.beta
+    wrong = np.zeros(len(solid), dtype=bool)
+    if chain.subpixel:
+        filtered = chain.filter @ phi
+        width = half_width(filtered, 0.5, chain.differences)
+        edges = np.abs(filtered) < width
+        level = edge_at(threshold) * float(np.mean(width[edges])) if edges.any() else 0.0
+        wrong = solid != (filtered >= level)
     scene, particles = problem.scene, problem.particles
     spacing = scene.grid.dx / scene.particles_per_cell
     body = discretise(scene, whole=True)
@@ -124,6 +134,9 @@ def outline(
     drives = body.actuator >= 0
     shown = {"body": drives | ~drives, "passive": ~drives, "actuator": drives}[part]
     cut |= ~shown
+    put = of_all(wrong & drawn, False)
+    empty[i[put], j[put]] = SOLID
+    cut |= of_all(wrong & ~solid, False)
     empty[i[cut], j[cut]] = OUTSIDE
     field = samples(empty)
     lines = [
