@@ -29,6 +29,7 @@ from mpmopt.scene import (
 )
 from mpmopt.scene.particles import discretise
 from mpmopt.scene.scene import Formulation
+from mpmopt.simulation.checkpoints import Checkpointing
 from mpmopt.simulation.formulations import simulation_of
 from mpmopt.simulation.reference import step
 from mpmopt.simulation.surroundings import parameters_of
@@ -58,10 +59,10 @@ def moving(**changes):
     return finger(Clamp((1 * C, 5 * C), (6 * C, 10 * C), PATH), **changes)
 
 
-def at_ease(scene):
-    """A simulation of all that is solid, whose actuators do nothing."""
+def at_ease(scene, zero=0.0) -> Any:
+    """A simulation of all that is solid, whose actuators do nothing; of numbers like zero."""
     particles = discretise(scene)
-    ones = np.ones(len(particles.position))
+    ones = np.ones(len(particles.position)) + zero
     return simulation_of(
         scene, particles, ones, ones, np.zeros((scene.steps, len(scene.actuators)))
     )
@@ -98,6 +99,10 @@ def test_what_is_inside_a_moving_clamp_follows_its_path(formulation):
     assert moved[-1] == pytest.approx((0.02, -0.01))
     found = states[:, :2, inside] - start[:2, inside]
     assert np.abs(found - moved[:, :, None]).max() <= 1e-14
+    before = scene.clamps[0].displacement(scene.time_step * np.maximum(np.array(frames) - 1, 0))
+    speed = ((moved - before) / scene.time_step)[:, :, None]
+    assert np.abs(speed).max() > 0.2
+    assert np.abs(states[:, 2:4, inside] - speed).max() <= 1e-12
     assert np.abs(states[:, 8:, inside] - start[8:, inside]).max() <= 1e-12
 
 
@@ -152,6 +157,28 @@ def test_the_gradient_of_a_lattice_that_is_clamped_is_exact(rng, scene):
     count = int(problem.particles.designed.sum())
     x = problem.join(rng.uniform(-1.0, 1.0, count), 0.9, -0.3, -0.5)
     assert worst(complex_step_test(problem, x)) <= 1e-12
+
+
+def test_where_held_nodes_begin_matters_as_far_as_they_move_others(rng):
+    # Beside a corner of ground, which would turn what holds nodes if they stuck to it.
+    corner = (Ground(((0.0, 0.0), (4.6 * C, 5.9 * C), (24 * C, 0.0)), friction="stick",
+                     thickness=C),)  # fmt: skip
+    scene = moving(
+        ground=corner, formulation="total", material=Material(viscosity=0.02), time_step=1e-3,
+        steps=40,
+    )  # fmt: skip
+    simulation = at_ease(scene)
+    terminal = rng.standard_normal(simulation.initial.shape)
+    terminal[4:8] = 0.0
+    with simulation.checkpoints(Checkpointing()) as checkpoints:
+        gradient = simulation.forward(checkpoints).reverse({40: terminal})
+    direction = np.zeros(gradient.state.shape)
+    held = simulation.lattice.held
+    direction[:, held] = rng.standard_normal((4, len(held)))
+    moved = at_ease(scene, 0j)
+    moved.start[:] = simulation.start + 1e-30j * direction
+    found = (terminal * moved.run()).sum().imag / 1e-30
+    assert found == pytest.approx((gradient.state * direction).sum(), rel=1e-11)
 
 
 @both
