@@ -280,6 +280,7 @@ def test_a_robot_on_walls_has_no_study():
     "end, way, height, angle",
     [
         ("goes on", lambda t: 0.1 * t, lambda t: 1.0 + 0 * t, lambda t: 0.2 * np.sin(t)),
+        ("goes on", lambda t: 0.1 * t, lambda t: np.where(t < 0.5, 3.0, 1.0), lambda t: 0 * t),
         ("falls", lambda t: 0.1 * t, lambda t: np.where(t < 6.0, 1.0, 0.4), lambda t: 0 * t),
         ("falls", lambda t: 0.1 * t, lambda t: 1.0 + 0 * t, lambda t: np.where(t < 6.0, 0.0, -0.8)),
         ("stops", lambda t: 0.1 * np.minimum(t, 6.0), lambda t: 1.0 + 0 * t, lambda t: 0 * t),

@@ -32,8 +32,9 @@ from mpmopt.scene.particles import Particles, discretise, mirror_images, nearest
 from mpmopt.scene.scene import LAGRANGIAN_LIMIT, Formulation
 from mpmopt.simulation.simulation import Simulation
 
-# In units of `unit`: what comes before does not count, and when a speed has been seen.
-SETTLED, SEEN, FOLLOWED = 2.0, 8.0, 20.0
+# In units of `unit`: when a robot stands, what comes before does not count, and when a speed has
+# been seen.
+STANDS, SETTLED, SEEN, FOLLOWED = 1.0, 2.0, 8.0, 20.0
 FEW_FRICTIONS = (0.2, 0.35, 0.5, 0.8)
 FRICTIONS = (0.2, 0.3, 0.35, 0.5, 0.65, 0.8, 1.5)
 CHANGES = (0.8, 1.2)  # of the actuators' strength and frequency
@@ -42,8 +43,8 @@ CHANGES = (0.8, 1.2)  # of the actuators' strength and frequency
 PUSH, PUSHED, RECOVERED = 0.05, 3.0, 4.0
 # Room for the way, in longer sides of the body.
 ROOM = 12.0
-# It has fallen when it leans by this angle, or is nearer to the ground than this share of its first
-# distance; it has stopped when it goes less than this share of its speed for so long.
+# It has fallen when it leans by this angle, or is nearer to the ground than this share of the
+# distance at which it stands; it has stopped when it goes less than this share of its speed for so long.
 LEANS, LOW, SLOW, PAUSE = math.radians(45.0), 0.5, 0.1, 2.0
 # Speeds of less than this share of the body's longer side per unit of time have no shares.
 LEAST = 2e-3
@@ -259,8 +260,9 @@ def follow(robot: Robot, scene: Scene) -> Followed:
     """Follow a robot for long, and say when it falls or stops.
 
     It falls where its solid and actuators, on the average, lean by 45 degrees, or their centroid is
-    half as far from the ground as at first. It stops where it goes less than a tenth of its speed
-    for `PAUSE` times `unit`.
+    half as far from the ground as on the average between `STANDS` and `SETTLED`: it may be drawn
+    above the ground. It stops where it goes less than a tenth of its speed for `PAUSE`. All times
+    are in units of `unit`.
     """
     one = unit(scene)
     scene = lasting(scene, one * FOLLOWED)
@@ -275,10 +277,13 @@ def follow(robot: Robot, scene: Scene) -> Followed:
         frames = frames[frames < error.step]
         states = simulation.run(frames.tolist())
     way, height, angle = track(scene, simulation.particles, states)
-    fallen = height < LOW * height[0]
+    time = time[: len(way)]
+    stands = (time >= one * STANDS) & (time <= one * SETTLED)
+    fallen = np.zeros(len(time), dtype=bool)
+    if stands.any():
+        fallen = (height < LOW * height[stands].mean()) & (time >= one * STANDS)
     if scene.mirror is None:  # of half a body both sides may lean
         fallen |= np.abs(angle) > LEANS
-    time = time[: len(way)]
     seen = np.flatnonzero((time >= one * SETTLED) & (time <= one * SEEN))
     first, last = (seen[0], seen[-1]) if seen.size > 1 else (0, -1)
     mean = max(float(way[last] - way[first]) / float(np.ptp(time[[first, last]]) or 1.0), 0.0)
