@@ -44,7 +44,8 @@ PUSH, PUSHED, RECOVERED = 0.05, 3.0, 4.0
 # Room for the way, in longer sides of the body.
 ROOM = 12.0
 # It has fallen when it leans by this angle, or is nearer to the ground than this share of the
-# distance at which it stands; it has stopped when it goes less than this share of its speed for so long.
+# distance at which it stands; it has stopped when it goes less than this share of its speed for so
+# long.
 LEANS, LOW, SLOW, PAUSE = math.radians(45.0), 0.5, 0.1, 2.0
 # Speeds of less than this share of the body's longer side per unit of time have no shares.
 LEAST = 2e-3
