@@ -29,6 +29,7 @@ from walker import walker, walker_on_ground
 from mpmopt.design.ensemble import side_by_side
 from mpmopt.design.objective import Objective
 from mpmopt.design.problem import Problem
+from mpmopt.scene import Grid
 from mpmopt.scene.scene import Formulation
 from mpmopt.simulation.checkpoints import Checkpointing
 from mpmopt.simulation.simulation import Simulation
@@ -127,8 +128,16 @@ def on_ground(
     cells: int, steps: int, formulation: Formulation = "total"
 ) -> tuple[Simulation, Objective]:
     """The walker on ground, with its layer and viscosity."""
-    scene = walker_on_ground(cells, 2e-4 * 128 / cells, 4.0)
-    problem = Problem(replace(scene, steps=steps, transient=0.0, formulation=formulation))
+    scene = replace(
+        walker_on_ground(64, 4e-4, 4.0),
+        grid=Grid((3 * cells // 2, cells), 1 / cells),
+        time_step=1.6e-4 * 128 / cells,  # viscosity bears no more on the finest cells
+        steps=steps,
+        transient=0.0,
+        filter_length=0.0,  # a physical length would take too many passes on the finest cells
+        formulation=formulation,
+    )
+    problem = Problem(scene)
     phi = np.random.default_rng(0).uniform(-0.5, 0.5, int(problem.particles.designed.sum()))
     simulation = problem.simulation(problem.join(phi, 1.0, -0.3, -0.5))
     return simulation, Objective.of(problem.scene, simulation.particles)
