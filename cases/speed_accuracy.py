@@ -544,7 +544,7 @@ def at_equal_accuracy(points: Sequence[Point], apart: dict[str, float]) -> list[
 def write_csv(path: Path, rows: Sequence[dict[str, str]]) -> None:
     """A table with a header."""
     with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
+        writer = csv.DictWriter(file, list(rows[0]) if rows else [], lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
 

@@ -230,8 +230,8 @@ def test_a_lattice_is_held_in_all_cells_of_a_clamp_and_the_first_clamp_has_it():
 
 def test_a_clamp_that_holds_nothing_of_a_lattice_is_refused():
     away = Clamp((12 * C, 12 * C), (14 * C, 14 * C))
-    with pytest.raises(SceneError, match=r"clamp 1 holds no node of the body.*updated"):
-        at_ease(finger(Clamp((2 * C, 6 * C), (4 * C, 9 * C)), away, formulation="total"))
+    with pytest.raises(SceneError, match=r"clamp 1, .* holds nothing of the body.*updated"):
+        finger(Clamp((2 * C, 6 * C), (4 * C, 9 * C)), away, formulation="total")
 
 
 def where_it_is_held(per_cell):

@@ -160,7 +160,7 @@ def test_a_chart_is_left_with_its_tables(tmp_path, monkeypatch, drawn):
         ("bar", "32", TOTAL.name),
         *((name, n, PLAIN.name) for name in ("walker", "crawler") for n in ("32", "32", "64")),
         *((f"{name} on ground", "32", choice.name) for name in ("walker", "crawler")
-          for choice in (PLAIN, TOTAL)),
+          for choice in (PLAIN, PLAIN, TOTAL)),
     ]  # fmt: skip
     assert not any(row["failure"] for row in rows)
     with h5py.File(tmp_path / "speed_accuracy.h5") as file:

@@ -87,8 +87,11 @@ def _elsewhere(summary: Mapping[str, Any]) -> dict[str, str]:
     by_friction = ", ".join(f"{_shown(speed)} at {friction}" for friction, speed in table)
     driven = summary["driven_share"]
     share = "" if driven is None else f"; {driven:.0%} of the speed is driven"
-    speed = f"{_shown(summary['speed'])} once it goes steadily{share}"
-    return {"speed": f"{speed}; by friction: {by_friction}"}
+    speed = f"{_shown(summary['speed'])} after the transient{share}"
+    followed = summary.get("followed") or {"end": "goes on"}
+    end = followed["end"]
+    went = "" if end == "goes on" else f"; after {digits(followed['seconds'], 3)} it {end}"
+    return {"speed": f"{speed}{went}; by friction: {by_friction}"}
 
 
 def _pieces(summary: Mapping[str, Any]) -> str:

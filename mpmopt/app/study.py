@@ -64,5 +64,10 @@ def full_study(path: str | os.PathLike[str]) -> str:
             from mpmopt.view.gait import plot_robustness
 
             draw_or_warn(path.parent / "robustness.png", lambda at: plot_robustness(at, summary))
+        page = path.parent / "report.html"
+        if page.exists():
+            from mpmopt.view.report import report
+
+            draw_or_warn(page, lambda at: report(at, kept.run, summary, kept.versions, path))
     names = (*robustness.NAMES, "failures")
     return table({name: summary[name] for name in names if name in summary})

@@ -396,9 +396,13 @@ def study(
     for kind in ("cells", "step", "strength", "frequency"):
         speeds[f"{kind} 1"] = nominal
 
+    least = LEAST * max(scene.extent)
+    if nominal is not None and not nominal > least:
+        failures["shares"] = f"the robot stands: a speed of less than {least:.2g} has no shares"
+
     def share(name: str) -> float | None:
         value = speeds[name]
-        if value is None or nominal is None or not nominal > LEAST * max(scene.extent):
+        if value is None or nominal is None or not nominal > least:
             return None
         return value / nominal
 

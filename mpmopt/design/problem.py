@@ -210,7 +210,8 @@ class Problem:
     def present(self, phi: NDArray) -> NDArray[np.bool_]:
         """Which of all particles are simulated (N,)."""
         present = np.ones(len(self.particles.position), dtype=bool)
-        present[self.particles.designed] = self.chain.field(phi).gamma.real >= self.void_cutoff
+        if self.void_cutoff > 0.0:  # gamma may be below zero by rounding
+            present[self.particles.designed] = self.chain.field(phi).gamma.real >= self.void_cutoff
         return present
 
     def simulation(self, x: NDArray) -> Simulation:

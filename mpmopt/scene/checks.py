@@ -199,6 +199,16 @@ def check_formulation(scene: Scene) -> None:
             f'Scene: the formulation "total" has no grid for {len(scene.walls)} walls; stand the '
             'body on a Ground, or take "updated"'
         )
+    for number, clamp in enumerate(scene.clamps):
+        if not any(
+            all(clamp.lower[k] <= part.upper[k] and part.lower[k] <= clamp.upper[k] for k in (0, 1))
+            for part in scene.body
+        ):
+            raise SceneError(
+                f"Scene: clamp {number}, {clamp.lower} to {clamp.upper}, holds nothing of the body "
+                'at first, and the formulation "total" takes up nothing later; move it onto the '
+                'body, or take "updated"'
+            )
 
 
 def check_stability(scene: Scene) -> None:

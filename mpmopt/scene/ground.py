@@ -216,7 +216,8 @@ class Line:
             here = np.where(flat, normal[0] * r[0] + normal[1] * r[1], length)
             d = np.where(closer, here, d)
             for axis in (0, 1):
-                n[axis] = np.where(closer, np.where(flat, normal[axis], s[axis] / length), n[axis])
+                away = s[axis] / np.where(length == 0.0, 1.0, length)
+                n[axis] = np.where(closer, np.where(flat, normal[axis], away), n[axis])
         return d, n
 
 

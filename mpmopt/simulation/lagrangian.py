@@ -10,7 +10,7 @@ import scipy.sparse
 from numpy.typing import DTypeLike, NDArray
 
 from mpmopt import kernels
-from mpmopt.errors import DesignError, SceneError, SimulationError
+from mpmopt.errors import DesignError, SimulationError
 from mpmopt.kernels import lagrangian, lattice_indicators, pairs
 from mpmopt.scene.parts import Vector
 from mpmopt.simulation.buffers import Memory
@@ -79,11 +79,6 @@ class LagrangianSimulation(Simulation):
         # Nodes are in the middle of cells: so all nodes of a cell are held that is in a clamp.
         holder = holders(self.start[:2].real, self.parameters.clamps[0], 0.5 * dx)
         held = np.nonzero(holder >= 0)[0]
-        for k in set(range(len(scene.clamps))) - set(holder[held].tolist()):
-            raise SceneError(
-                f"Scene: clamp {k} holds no node of the body at first, and the formulation "
-                '"total" takes up none later; move it onto the body, or take "updated"'
-            )
         self.lattice = lagrangian.Lattice(
             dt=scene.time_step,
             dx=dx,
