@@ -12,6 +12,7 @@ import pytest
 from conftest import small_scene
 
 from mpmopt.__main__ import main
+from mpmopt.app.case import resume
 from mpmopt.assess.threshold import post_processed
 from mpmopt.design.problem import Problem
 from mpmopt.errors import DesignError, RunFileError, StorageError
@@ -312,3 +313,12 @@ def test_postprocess_refuses_a_threshold_that_makes_no_sense(path, capsys, thres
 def test_an_unknown_command_is_not_understood():
     assert command("fly").returncode == 2
     assert "verify" in command("--help").stdout
+
+
+def test_what_is_no_run_file_or_not_there_says_so(tmp_path):
+    text = tmp_path / "robot.py"
+    text.write_text("scene = None\n" * 20)
+    with pytest.raises(RunFileError, match="it is no HDF5 file: give the path of a run file"):
+        runfile.read_run(text)
+    with pytest.raises(RunFileError, match=r"run\.h5 is not there"):
+        resume(tmp_path / "gone" / "run.h5")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from conftest import SHORT, small_scene
 
-from mpmopt.app import case, summary
+from mpmopt.app import case, ending, summary
 from mpmopt.app.case import Case
 from mpmopt.app.summary import summarise
 from mpmopt.assess import refinement, threshold
@@ -306,3 +306,14 @@ def test_the_presets_are_what_they_say():
     assert {(s.halvings, s.limited) for s in paper.stages} == {(0, False)}
     assert (paper.adapt_move_limit, paper.sharpen_asymptotes, paper.best_first) == 3 * (False,)
     assert (paper.window, paper.tolerance) == (10, 2e-4)
+
+
+def test_the_table_at_the_end_says_what_a_number_is_of():
+    summary = {
+        "disconnected_particles": 6, "components": 2, "speed": 1e-4, "driven_share": None,
+        "speed_by_friction": {}, "failures": {"shares": "the robot stands"},
+    }  # fmt: skip
+    assert "they count in displacement, not in speed" in ending._pieces(summary)
+    assert "it stands" in ending._elsewhere(summary)["speed"]
+    moved = {**summary, "failures": {}, "followed": {"end": "falls", "seconds": 9.06}}
+    assert "after 9.06 it falls" in ending._elsewhere(moved)["speed"]

@@ -201,6 +201,8 @@ def resume(
     """
     # A link would be replaced, not what it leads to.
     path = Path(os.path.realpath(place("resume", "path", path)))
+    if not path.exists():
+        raise RunFileError(f"{path} is not there; give the path of a run.h5")
     with locked(path):
         return _go_on(path, runfile.read_run(path), checkpointing)
 

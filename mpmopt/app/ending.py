@@ -90,13 +90,16 @@ def _elsewhere(summary: Mapping[str, Any]) -> dict[str, str]:
     speed = f"{_shown(summary['speed'])} after the transient{share}"
     followed = summary.get("followed") or {"end": "goes on"}
     end = followed["end"]
-    went = "" if end == "goes on" else f"; after {digits(followed['seconds'], 3)} it {end}"
+    stands = "; it stands" if "shares" in summary.get("failures", {}) else ""
+    went = stands if end == "goes on" else f"; after {digits(followed['seconds'], 3)} it {end}"
     return {"speed": f"{speed}{went}; by friction: {by_friction}"}
 
 
 def _pieces(summary: Mapping[str, Any]) -> str:
     loose, count = summary["disconnected_particles"], summary.get("components", 1)
-    return f"{count}, {loose} particles hang on nothing" if loose else f"{count}, nothing is loose"
+    if not loose:
+        return f"{count}, nothing is loose"
+    return f"{count}, {loose} particles hang on nothing: they count in displacement, not in speed"
 
 
 def _files(path: Path) -> list[str]:

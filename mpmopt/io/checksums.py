@@ -50,6 +50,8 @@ def unsealed(path: Path, kind: str, writable: bool = False) -> h5py.File:
     found, wanted = sealed(image)[-SEAL:], content[-SEAL:]
     # HDF5 may read a damaged file for ever, so it sees none.
     if not wanted.startswith(b"\nmpmopt sha256 "):
+        if not content.startswith(b"\x89HDF"):
+            raise ValueError(f"it is no HDF5 file: give the path of a {kind}")
         raise ValueError("it has no digest at its end: it is of an older mpmopt, or was cut")
     if found != wanted:
         raise ValueError(
