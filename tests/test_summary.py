@@ -316,4 +316,4 @@ def test_the_table_at_the_end_says_what_a_number_is_of():
     assert "they count in displacement, not in speed" in ending._pieces(summary)
     assert "it stands" in ending._elsewhere(summary)["speed"]
     moved = {**summary, "failures": {}, "followed": {"end": "falls", "seconds": 9.06}}
-    assert "after 9.06 it falls" in ending._elsewhere(moved)["speed"]
+    assert "at 9.06: falls" in ending._elsewhere(moved)["speed"]

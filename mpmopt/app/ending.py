@@ -91,7 +91,7 @@ def _elsewhere(summary: Mapping[str, Any]) -> dict[str, str]:
     followed = summary.get("followed") or {"end": "goes on"}
     end = followed["end"]
     stands = "; it stands" if "shares" in summary.get("failures", {}) else ""
-    went = stands if end == "goes on" else f"; after {digits(followed['seconds'], 3)} it {end}"
+    went = stands if end == "goes on" else f"; at {digits(followed['seconds'], 3)}: {end}"
     return {"speed": f"{speed}{went}; by friction: {by_friction}"}
 
 
