@@ -12,11 +12,10 @@ import numpy as np
 
 from mpmopt.app.case import Case
 from mpmopt.app.script import main
-from mpmopt.design.one_piece import OnePiece
-from mpmopt.design.task import AtMost, Task
+from mpmopt.design.task import Task
 from mpmopt.design.variables import Bounded, Tied
 from mpmopt.design.variation import Variation
-from mpmopt.optimisation.presets import gait
+from mpmopt.optimisation.presets import IN_ONE_PIECE, gait
 from mpmopt.scene import Actuator, Design, Grid, Ground, Material, Mirror, Scene
 
 
@@ -80,7 +79,7 @@ START = {"phi": start, "a": 1.0, "theta": (-0.8, -0.5, -0.7), "b": -0.3, "omega"
 
 # Cores of one frequency: others would drift out of step.
 TASK = Task(
-    subject_to=(AtMost(OnePiece(), -0.4),),
+    subject_to=(IN_ONE_PIECE,),
     scenes=(
         Variation(friction=0.7, strength=0.9),
         Variation(friction=0.9),

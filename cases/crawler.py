@@ -15,11 +15,10 @@ import numpy as np
 
 from mpmopt.app.case import Case
 from mpmopt.app.script import main
-from mpmopt.design.one_piece import OnePiece
-from mpmopt.design.task import AtMost, Task
+from mpmopt.design.task import Task
 from mpmopt.design.variables import Bounded
 from mpmopt.design.variation import Variation
-from mpmopt.optimisation.presets import gait, paper_preset
+from mpmopt.optimisation.presets import IN_ONE_PIECE, gait, paper_preset
 from mpmopt.scene import Actuator, Design, Grid, Ground, Material, Mirror, Scene, Wall
 
 
@@ -107,9 +106,8 @@ def start(positions: np.ndarray) -> np.ndarray:
 
 START = {"phi": start, "a": 1.0, "theta": 0.6, "b": -0.3, "omega": 0.7}
 
-# Its actuator takes heat from three sides, so the bound of other robots would let small corners go.
 TASK = Task(
-    subject_to=(AtMost(OnePiece(), -0.4),),
+    subject_to=(IN_ONE_PIECE,),
     scenes=(
         Variation(friction=0.28, strength=0.9),
         Variation(friction=0.45),

@@ -16,11 +16,10 @@ import numpy as np
 
 from mpmopt.app.case import Case
 from mpmopt.app.script import main
-from mpmopt.design.one_piece import OnePiece
-from mpmopt.design.task import AtMost, Task
+from mpmopt.design.task import Task
 from mpmopt.design.variables import Bounded
 from mpmopt.design.variation import Variation
-from mpmopt.optimisation.presets import gait, paper_preset
+from mpmopt.optimisation.presets import IN_ONE_PIECE, gait, paper_preset
 from mpmopt.scene import Actuator, Design, Grid, Ground, Material, Scene, Solid, Wall
 
 AHEAD = 8 / 64  # of the paper's body is the one on ground
@@ -112,7 +111,7 @@ TASK = Task(
         Variation(friction=0.45, thickness=2.0),
         Variation(friction=0.72, strength=1.1, threshold=0.6),
     ),
-    subject_to=(AtMost(OnePiece(), -0.4),),
+    subject_to=(IN_ONE_PIECE,),
     variables=(Bounded("b", lower=-0.4, upper=0.4),),
     soft_minimum=8.0,
 )
