@@ -260,7 +260,7 @@ def test_resume_of_no_run_is_an_error(tmp_path, capsys):
     command = [sys.executable, "-m", "mpmopt", "resume", str(tmp_path / "no" / "run.h5")]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 1
-    assert done.stderr.startswith("StorageError: ")
+    assert done.stderr.startswith("RunFileError: ") and "is not there" in done.stderr
 
 
 def test_other_versions_are_warned_of(tmp_path, caplog, monkeypatch):
