@@ -15,7 +15,7 @@ from mpmopt.app.script import main
 from mpmopt.design.task import Task
 from mpmopt.design.variables import Bounded, Tied
 from mpmopt.design.variation import Variation
-from mpmopt.optimisation.presets import IN_ONE_PIECE, gait
+from mpmopt.optimisation.presets import IN_ONE_PIECE, black_and_white, gait
 from mpmopt.scene import Actuator, Design, Grid, Ground, Material, Mirror, Scene
 
 
@@ -70,12 +70,13 @@ def three_pairs(positions: np.ndarray) -> np.ndarray:
     return np.any([*legs, away <= 2 / 6], axis=0)
 
 
-def start(positions: np.ndarray) -> np.ndarray:
-    """The drawing, black and white."""
-    return np.where(three_pairs(positions), 1.0, -1.0)
-
-
-START = {"phi": start, "a": 1.0, "theta": (-0.8, -0.5, -0.7), "b": -0.3, "omega": 0.9}
+START = {
+    "phi": black_and_white(three_pairs),
+    "a": 1.0,
+    "theta": (-0.8, -0.5, -0.7),
+    "b": -0.3,
+    "omega": 0.9,
+}
 
 # Cores of one frequency: others would drift out of step.
 TASK = Task(

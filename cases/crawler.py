@@ -18,7 +18,7 @@ from mpmopt.app.script import main
 from mpmopt.design.task import Task
 from mpmopt.design.variables import Bounded
 from mpmopt.design.variation import Variation
-from mpmopt.optimisation.presets import IN_ONE_PIECE, gait, paper_preset
+from mpmopt.optimisation.presets import IN_ONE_PIECE, black_and_white, gait, paper_preset
 from mpmopt.scene import Actuator, Design, Grid, Ground, Material, Mirror, Scene, Wall
 
 
@@ -99,12 +99,7 @@ def two_pairs(positions: np.ndarray) -> np.ndarray:
     return np.any([*legs, height <= 2 / 6, skin], axis=0)
 
 
-def start(positions: np.ndarray) -> np.ndarray:
-    """The drawing, black and white."""
-    return np.where(two_pairs(positions), 1.0, -1.0)
-
-
-START = {"phi": start, "a": 1.0, "theta": 0.6, "b": -0.3, "omega": 0.7}
+START = {"phi": black_and_white(two_pairs), "a": 1.0, "theta": 0.6, "b": -0.3, "omega": 0.7}
 
 TASK = Task(
     subject_to=(IN_ONE_PIECE,),

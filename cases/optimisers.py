@@ -2,9 +2,9 @@
 
     python cases/optimisers.py --out DIR
 
-Each takes as many evaluations, from the case's own start and from random ones (`random_start`).
-Leaves the run file of each run, and ``optimisers.csv``: speeds of the finished robots without grey.
-What was stopped goes on.
+Each takes as many evaluations, from the case's own start and from random ones
+(`multistart.disturbed`). Leaves the run file of each run, and ``optimisers.csv``: speeds of the
+finished robots without grey. What was stopped goes on.
 """
 
 import argparse
@@ -14,11 +14,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import walker
-from numpy.typing import NDArray
 
-from mpmopt.app.multistart import random_start
+from mpmopt.app.multistart import disturbed
 from mpmopt.app.sweeps import as_csv
 from mpmopt.assess.robustness import Robot, Trial, speed
 from mpmopt.design.task import Task
@@ -71,12 +69,9 @@ WAYS: Mapping[str, tuple[Settings, Task]] = {
 
 def start_of(seed: int) -> dict[str, Any]:
     """The case's start; with a seed, one with a smooth random field added, as `--starts` has."""
-    drawn, noise = CASE.start["phi"], random_start(CASE.scene, seed)
-
-    def phi(positions: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.clip(drawn(positions) + noise(positions), -1.0, 1.0)
-
-    return {**CASE.start, "phi": phi} if seed else dict(CASE.start)
+    if not seed:
+        return dict(CASE.start)
+    return {**CASE.start, "phi": disturbed(CASE.start["phi"], CASE.scene, seed)}
 
 
 def finished(path: Path, settings: Settings, task: Task, seed: int) -> Optimisation:

@@ -17,7 +17,7 @@ import walker
 
 from mpmopt.app.case import Case
 from mpmopt.app.script import main
-from mpmopt.optimisation.presets import gait
+from mpmopt.optimisation.presets import black_and_white, gait
 from mpmopt.scene import SILICONES, Actuator, Design, Grid, Ground, Scene, Solid
 
 MM = 1e-3
@@ -67,12 +67,7 @@ def two_legs(positions: np.ndarray) -> np.ndarray:
     return walker.two_legs(((positions - (LEFT, FOOT)) / CELL + (11, 4)) / 64)
 
 
-def start(positions: np.ndarray) -> np.ndarray:
-    """The drawing, black and white."""
-    return np.where(two_legs(positions), 1.0, -1.0)
-
-
-START = {"phi": start, "a": 1.0, "theta": 0.7, "b": -0.2, "omega": 0.3}
+START = {"phi": black_and_white(two_legs), "a": 1.0, "theta": 0.7, "b": -0.2, "omega": 0.3}
 
 # The walker's in metres, without thinner and thicker designs, which do not stride at one frequency.
 TASK = replace(

@@ -53,7 +53,7 @@ def hills(seed: int, depth: float = C, far: float = NEAR) -> Ground:
 
 def rough(seed: int = 0, depth: float = C, scene: Scene = FLAT) -> Scene:
     """The walker on hills and hollows."""
-    return on(hills(seed, depth, FAR), scene)
+    return replace(scene, ground=(hills(seed, depth, FAR),))
 
 
 # As the walker's, but each on other hills.

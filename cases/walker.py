@@ -19,7 +19,7 @@ from mpmopt.app.script import main
 from mpmopt.design.task import Task
 from mpmopt.design.variables import Bounded
 from mpmopt.design.variation import Variation
-from mpmopt.optimisation.presets import IN_ONE_PIECE, gait, paper_preset
+from mpmopt.optimisation.presets import IN_ONE_PIECE, black_and_white, gait, paper_preset
 from mpmopt.scene import Actuator, Design, Grid, Ground, Material, Scene, Solid, Wall
 
 AHEAD = 8 / 64  # of the paper's body is the one on ground
@@ -96,12 +96,7 @@ def two_legs(positions: np.ndarray) -> np.ndarray:
     return np.any([*legs, depth <= c], axis=0)
 
 
-def start(positions: np.ndarray) -> np.ndarray:
-    """The drawing, black and white."""
-    return np.where(two_legs(positions), 1.0, -1.0)
-
-
-START = {"phi": start, "a": 1.0, "theta": 0.7, "b": -0.4, "omega": 0.8}
+START = {"phi": black_and_white(two_legs), "a": 1.0, "theta": 0.7, "b": -0.4, "omega": 0.8}
 
 # What nobody knows of the world: friction, softness of the ground, strength, and how exactly it was
 # made. The actuator is not held squeezed, which would stretch the skin until MLS-MPM tears it.

@@ -65,6 +65,19 @@ def random_start(scene: Scene, seed: int) -> Callable[[NDArray], NDArray[np.floa
     return field
 
 
+def disturbed(
+    phi: NDArray | Callable[[NDArray], NDArray], scene: Scene, seed: int
+) -> Callable[[NDArray], NDArray[np.float64]]:
+    """A start's phi, an array or a function, with a `random_start` added; within [-1, 1]."""
+    noise = random_start(scene, seed)
+
+    def field(position: NDArray) -> NDArray[np.float64]:
+        own = phi(position) if callable(phi) else phi
+        return np.clip(own + noise(position), -1.0, 1.0)
+
+    return field
+
+
 def one_start(
     scene: str,
     settings: dict[str, Any],
@@ -93,13 +106,9 @@ def one_start(
     folder.mkdir(parents=True, exist_ok=True)
     # Paths may hold what is no text.
     log = (folder / "log.txt").open("a", buffering=1, encoding="utf-8", errors="backslashreplace")
-    own, noise = np.asarray(start["phi"], dtype=float), random_start(case.scene, seed)
-
-    def phi(position: NDArray) -> NDArray[np.float64]:
-        return np.clip(own + noise(position), -1.0, 1.0)
-
+    phi = disturbed(np.asarray(start["phi"], dtype=float), case.scene, seed) if seed else None
     with log, contextlib.redirect_stderr(log):
-        summary = run(case, folder, phi=phi if seed else None)
+        summary = run(case, folder, phi=phi)
 
     def number(value: float | None) -> float:
         return math.nan if value is None else float(value)

@@ -60,14 +60,14 @@ def full_study(path: str | os.PathLike[str]) -> str:
             text = json.dumps(summary, indent=1) + "\n"
             replace_file(path.parent / "summary.json", text.encode())
             runfile.write(path, kept.run, summary, kept.baseline, kept.full_study)
+            page = path.parent / "report.html"
+            if page.exists():
+                from mpmopt.view.report import report
+
+                draw_or_warn(page, lambda at: report(at, kept.run, summary, kept.versions, path))
         if "speed" in summary:
             from mpmopt.view.gait import plot_robustness
 
             draw_or_warn(path.parent / "robustness.png", lambda at: plot_robustness(at, summary))
-        page = path.parent / "report.html"
-        if page.exists():
-            from mpmopt.view.report import report
-
-            draw_or_warn(page, lambda at: report(at, kept.run, summary, kept.versions, path))
     names = (*robustness.NAMES, "failures")
     return table({name: summary[name] for name in names if name in summary})

@@ -132,7 +132,12 @@ def _edge(
     reach = REACH * np.sqrt(squares + LEAST_SLOPE**2)
     s = (phi - (2.0 * threshold - 1.0)) / reach
     s = np.where(np.abs(s.real) < 1.0, s, np.sign(s.real))
-    return reach, s, 0.5 + 0.0625 * s * (15.0 - 10.0 * s**2 + 3.0 * s**4)
+    return reach, s, _rise(s)
+
+
+def _rise(s: NDArray) -> NDArray:
+    """F."""
+    return 0.5 + 0.0625 * s * (15.0 - 10.0 * s**2 + 3.0 * s**4)
 
 
 def half_width(
@@ -145,4 +150,4 @@ def half_width(
 def edge_at(gamma: float) -> float:
     """The s at which F is gamma."""
     s = np.linspace(-1.0, 1.0, 20001)
-    return float(np.interp(gamma, 0.5 + 0.0625 * s * (15.0 - 10.0 * s**2 + 3.0 * s**4), s))
+    return float(np.interp(gamma, _rise(s), s))

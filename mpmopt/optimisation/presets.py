@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
 from mpmopt.design.one_piece import OnePiece
 from mpmopt.design.task import AtMost
 from mpmopt.optimisation.settings import Settings, Stage
@@ -9,6 +14,11 @@ from mpmopt.optimisation.settings import Settings, Stage
 # Robots end at 0.3 to 0.6 of the solid reference design's; a loose piece takes a thousandfold, but
 # small corners only little.
 IN_ONE_PIECE = AtMost(OnePiece(), -0.4)
+
+
+def black_and_white(drawing: Callable[[NDArray], NDArray]) -> Callable[[NDArray], NDArray]:
+    """A start's phi: 1 where a drawing has material, and -1 where it has none."""
+    return lambda positions: np.where(drawing(positions), 1.0, -1.0)
 
 
 def continuation(time_step: float | None = None, most_iterations: int = 25) -> Settings:
