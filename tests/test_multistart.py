@@ -155,6 +155,29 @@ def test_the_plain_start_is_that_of_the_case(tmp_path, here):
     assert {-0.8, -0.5, -0.7} <= set(start)
 
 
+def test_only_random_starts_are_disturbed(tmp_path, monkeypatch, rng):
+    gain = dict.fromkeys(("as designed", "half the step", "cells half as wide"), 0.1)
+    summary: Any = collections.defaultdict(float, gain=gain, retained_gain=gain)
+    given: list[Any] = []
+
+    def run(case, folder, phi=None):
+        given.append(phi)
+        return summary
+
+    monkeypatch.setattr(multistart, "run", run)
+    for seed in (0, 1):
+        multistart.one_start(
+            SCENE.to_json(), dataclasses.asdict(TINY.settings), {**TINY.start, "phi": 0.25},
+            TINY.task.to_json(), seed,
+            baseline=slanted_legs, out=tmp_path,
+        )  # fmt: skip
+    own, disturbed = given
+    position = rng.uniform(0.2, 0.4, (20, 2))
+    assert own is None
+    noise = random_start(SCENE, 1)(position)
+    assert np.array_equal(disturbed(position), np.clip(0.25 + noise, -1.0, 1.0))
+
+
 def test_a_loss_is_not_scaled(tmp_path, monkeypatch):
     gain: dict[str, Any] = {"as designed": -0.1, "half the step": -0.05, "twice the step": -9.0,
             "cells half as wide": -0.2}  # fmt: skip
