@@ -1152,10 +1152,12 @@ def test_step_keeps_away_from_the_asymptotes():
 
 
 def test_least_convexity_of_the_objective_is_that_of_the_largest_gradient_seen():
-    """And forgotten by reset: the closed form with raa0 times 5, then times 0.01."""
+    """Until it is to be forgotten: the closed form with raa0 times 5, then times 0.01."""
     optimiser = MovingAsymptotes([0.0], [1.0], raa0=0.1)
-    for k, largest in enumerate((5.0, 5.0, 0.01)):
+    for k, largest in enumerate((5.0, 5.0, 0.01, 0.01)):
         if k == 2:
+            optimiser.forget_gradients()
+        if k == 3:
             optimiser.reset()
         slope = 5.0 if k == 0 else 0.01
         x = optimiser.step([0.5], 0.0, [slope])

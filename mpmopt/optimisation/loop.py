@@ -329,6 +329,7 @@ class _Ascent:
         x, gradients = self.freedom.reduced(item.x), self.freedom.pullback(gradients)
         f, dfdx = -item.objective / self.width, -gradients[0] / self.width
         constraints = self.run.task.subject_to
+        self.mma.forget_gradients()
         if not constraints:
             return self.freedom.whole(item.x, self.mma.step(x, f, dfdx))
         scale = np.array([constraint.scale for constraint in constraints])

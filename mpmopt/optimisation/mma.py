@@ -65,8 +65,8 @@ class MovingAsymptotes:
         is often used, can end in cycles of that size.
     raa0 : float
         Least convexity of the approximations. It is relative to the largest gradient of f seen
-        since the last reset, and to that of g_i at x, so that the iterates do not depend on the
-        scale of f or g.
+        since the last reset or `forget_gradients`, and to that of g_i at x, so that the iterates
+        do not depend on the scale of f or g.
 
     Attributes
     ----------
@@ -153,6 +153,14 @@ class MovingAsymptotes:
         self._slopes: Array | None = None  # of the last step; only the residual needs them
         self.kkt_residual = np.inf
         self.step_size = np.inf
+
+    def forget_gradients(self) -> None:
+        """Measure the least convexity by the gradients of the next step alone.
+
+        For a motion that may be chaotic: a gradient that it blew up would hold back all steps that
+        follow.
+        """
+        self.gradient_scale = np.zeros_like(self.gradient_scale)
 
     def state(self) -> dict[str, npt.NDArray[Any] | float | int]:
         """All that the next step depends on, as arrays and numbers, for `restore`."""
