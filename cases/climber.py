@@ -91,7 +91,7 @@ TASK = Task(
 )
 
 CASES = {
-    "default": Case(climber(64, 1e-3, 4.0), gait(120, 0.005), three_pairs, START, TASK),
+    "default": Case(climber(64, 1e-3, 4.0), gait(100, 0.005), three_pairs, START, TASK),
     "preview": Case(climber(64, 1e-3, 3.0), gait(40, 0.005), three_pairs, START, TASK),
 }
 

@@ -113,7 +113,7 @@ TASK = Task(
 )
 
 CASES = {
-    "default": Case(crawler_on_ground(64, 1e-3, 4.0), gait(120), two_pairs, START, TASK),
+    "default": Case(crawler_on_ground(64, 1e-3, 3.0), gait(80), two_pairs, START, TASK),
     "preview": Case(crawler_on_ground(64, 1e-3, 3.0), gait(40), two_pairs, START, TASK),
     "paper": Case(crawler(128, 2e-4), paper_preset(2e-4), slanted_legs),
 }

@@ -63,7 +63,6 @@ WAYS: Mapping[str, tuple[Settings, Task]] = {
     ),
     "moves of 0.05": (with_stages(replace(STAGE, move_limit=0.05)), TASK),
     "moves that adapt": (replace(SETTINGS, adapt_move_limit=True), TASK),
-    "asymptotes that close": (replace(SETTINGS, asymptote_min=1e-6), TASK),
 }  # fmt: skip
 
 

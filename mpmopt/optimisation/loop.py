@@ -250,7 +250,6 @@ class _Ascent:
             self.freedom.upper,
             move_limit=self.stage.move_limit,
             asymptote_initial=0.5 / (self.stage.beta + 1.0) if settings.sharpen_asymptotes else 0.5,
-            asymptote_min=settings.asymptote_min,
         )
         self.values: list[float] = []
         self.failures = 0

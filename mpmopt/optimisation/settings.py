@@ -146,9 +146,6 @@ class Settings:
         after one that went on.
     sharpen_asymptotes : bool
         Initial asymptotes at 0.5 / (beta + 1) of the range instead of 0.5.
-    asymptote_min : float
-        Least distance of an asymptote, as a fraction of the range. Svanberg's is 0.01: moves of a
-        design whose gradient changes its sign do not die out then, and do not converge either.
     best_first : bool
         Start each stage from the design of the one before that went farthest, instead of its last.
     window : int
@@ -173,7 +170,6 @@ class Settings:
     stages: tuple[Stage, ...] = STAGES
     adapt_move_limit: bool = True
     sharpen_asymptotes: bool = True
-    asymptote_min: float = 1e-6
     best_first: bool = True
     window: int = 10
     tolerance: float = 2e-4
@@ -190,7 +186,6 @@ class Settings:
         _take(self, flag, "adapt_move_limit sharpen_asymptotes best_first")
         _take(self, count, "window least_iterations most_iterations most_failures", least=1)
         _take(self, number, "tolerance")
-        _take(self, number, "asymptote_min", above=0.0)
         if self.least > self.most_iterations:
             raise DesignError(
                 f"Settings: least_iterations = {self.least_iterations} is above "
