@@ -6,7 +6,7 @@ All of it is Ecoflex 00-30, so one mould and one pour make it. The middle of its
 along the beam, by up to 8.4 kPa, 30 to 50 times a second: that is too quick for air, not for
 dielectric elastomers or magnets. The plane is a section, so masses and forces are those of a
 metre of depth: densities in kg/m^3 and stresses in Pa are those of the solid. The viscosity is an
-assumption: 20 Pa s is a loss factor of 0.064 in shear at 40 Hz. The ground yields by up to 1.5 mm.
+assumption: 30 Pa s is a loss factor of 0.096 in shear at 40 Hz. The ground yields by up to 1.5 mm.
 """
 
 import sys
@@ -23,7 +23,7 @@ from mpmopt.scene import SILICONES, Actuator, Design, Grid, Ground, Scene, Solid
 MM = 1e-3
 CELL = 3 * MM
 LEFT, FOOT = 8 * CELL, 2 * CELL  # where the body begins
-VISCOSITY = 20.0  # Pa s
+VISCOSITY = 30.0  # Pa s
 PRESSURE = 6e3  # Pa along the beam, at a signal of one
 FREQUENCY = 40.0  # Hz, and by how much of itself it may change
 DETUNING = 0.25
@@ -77,7 +77,7 @@ TASK = replace(
 )
 
 CASES = {
-    "default": Case(silicone_walker(0.5), gait(120, 0.01), two_legs, START, TASK),
+    "default": Case(silicone_walker(0.5), gait(80, 0.01), two_legs, START, TASK),
     "preview": Case(silicone_walker(), gait(40, 0.01), two_legs, START, TASK),
 }
 

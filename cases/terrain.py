@@ -68,7 +68,7 @@ TASK = replace(
 CASES = {
     "default": Case(
         rough(scene=walker.CASES["default"].scene),
-        gait(120),
+        gait(60),
         walker.two_legs,
         walker.START,
         TASK,
