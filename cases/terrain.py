@@ -68,7 +68,7 @@ TASK = replace(
 CASES = {
     "default": Case(
         rough(scene=walker.CASES["default"].scene),
-        gait(60),
+        gait(120),
         walker.two_legs,
         walker.START,
         TASK,
