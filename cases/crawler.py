@@ -99,8 +99,9 @@ def two_pairs(positions: np.ndarray) -> np.ndarray:
     return np.any([*legs, height <= 2 / 6, skin], axis=0)
 
 
-START = {"phi": black_and_white(two_pairs), "a": 1.0, "theta": 0.6, "b": -0.3, "omega": 0.7}
+START = {"phi": black_and_white(two_pairs), "a": 0.8, "theta": 0.6, "b": -0.3, "omega": 0.7}
 
+# A stronger core goes a third faster, but stretches until MLS-MPM tears it.
 TASK = Task(
     subject_to=(IN_ONE_PIECE,),
     scenes=(
@@ -108,7 +109,7 @@ TASK = Task(
         Variation(friction=0.45),
         Variation(friction=0.72, strength=1.1),
     ),
-    variables=(Bounded("b", lower=-0.4, upper=0.4),),
+    variables=(Bounded("a", lower=-0.8, upper=0.8), Bounded("b", lower=-0.3, upper=0.3)),
     soft_minimum=8.0,
 )
 
