@@ -86,7 +86,7 @@ TASK = Task(
         Variation(friction=0.9),
         Variation(friction=1.2, strength=1.1),
     ),
-    variables=(Bounded("b", lower=-0.5, upper=0.5), Tied("omega", to=0)),
+    variables=(Bounded("b", lower=-0.3, upper=0.3), Tied("omega", to=0)),
     soft_minimum=8.0,
 )
 
