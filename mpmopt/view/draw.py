@@ -276,7 +276,10 @@ def draw_design(axes: Axes, problem: Problem, x: NDArray[np.float64]) -> None:
 
 
 def draw_history(axes: Axes, run: Optimisation) -> None:
-    """Draw objective, beta and non-discreteness over a run's evaluations, stages marked."""
+    """Draw objective, beta and non-discreteness over a run's evaluations, stages marked.
+
+    Evaluations that break a constraint are open circles.
+    """
 
     def column(name: str) -> NDArray[np.float64]:
         return np.array([getattr(item, name) for item in run.history], dtype=float)
@@ -284,6 +287,10 @@ def draw_history(axes: Axes, run: Optimisation) -> None:
     number = np.arange(1, len(run.history) + 1)
     objective, solid = column("objective"), column("post_processed")
     lines: list[Any] = axes.plot(number, objective, "k.-", ms=4, lw=1, label="objective L")
+    missed = column("violation") > 0.0
+    if missed.any():
+        style = {"ms": 4, "mfc": "white", "ls": "none", "label": "breaks a constraint"}
+        lines += axes.plot(number[missed], objective[missed], "ko", **style)
     if not np.isnan(solid).all():
         lines += axes.plot(number, solid, "C1-", lw=1, label="post-processed L")
     failed = np.isnan(objective)
@@ -294,9 +301,9 @@ def draw_history(axes: Axes, run: Optimisation) -> None:
     axes.set_xlabel("evaluation")
     axes.set_ylabel("objective L (distance)")
     other = axes.twinx()
-    lines += other.plot(number, column("non_discreteness"), "C0-", lw=1, label="non_discreteness")
+    lines += other.plot(number, column("non_discreteness"), "C0-", lw=1, label="non-discreteness")
     other.set_ylim(0.0, 1.05)
-    other.set_ylabel("non_discreteness")
+    other.set_ylabel("non-discreteness")
     stage, beta = column("stage"), column("beta")
     changed = np.diff(stage) != 0
     for first in [0, *(np.flatnonzero(changed) + 1)]:
@@ -307,5 +314,5 @@ def draw_history(axes: Axes, run: Optimisation) -> None:
         )  # fmt: skip
     axes.set_xlim(0.5, len(number) + 0.5)
     labels = [str(line.get_label()) for line in lines]
-    axes.legend(lines, labels, loc="upper center", ncols=4, fontsize=8, frameon=False,
+    axes.legend(lines, labels, loc="upper center", ncols=3, fontsize=8, frameon=False,
                 bbox_to_anchor=(0.5, -0.12))  # fmt: skip
