@@ -189,8 +189,8 @@ class Scene(Checked):
             for wall in self.walls
         )
         ground = "".join(
-            f"; on ground from {ground.points[0]} to {ground.points[-1]} (friction "
-            f"{ground.friction})"
+            f"; on ground from {ground.points[0]} to {ground.points[-1]}: {ground.profile} "
+            f"(friction {ground.friction})"
             for ground in self.ground
         )
         if self.clamps:

@@ -34,8 +34,9 @@ OVERLAP = 1.15
 FAINTEST = 0.02
 # The longest arrow, over the longer side of the picture.
 LONGEST = 0.15
-# What is rigid.
+# What is rigid, and the ground's outline, of which small steps shall be seen.
 SOLID: dict[str, Any] = {"facecolor": "0.88", "edgecolor": "0.6", "hatch": "//", "lw": 0.8}
+OUTLINE: dict[str, Any] = {"fill": False, "edgecolor": "0.1", "lw": 1.3}
 
 
 @contextmanager
@@ -108,7 +109,8 @@ def draw_walls(axes: Axes, scene: Scene, moving: bool = False) -> None:
         axes.add_patch(Rectangle(corner, width, height, **SOLID))
     for ground in scene.ground:
         reach = 4.0 * (right - left + high - low)
-        axes.add_patch(Polygon(ground_outline(ground, reach), **SOLID))
+        for style in (SOLID, OUTLINE):
+            axes.add_patch(Polygon(ground_outline(ground, reach), **style))
     for clamp in scene.clamps:
         width, height = np.subtract(clamp.upper, clamp.lower)
         axes.add_patch(Rectangle(clamp.lower, width, height, fill=False, edgecolor="C1", ls="--"))
