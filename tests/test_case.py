@@ -271,7 +271,7 @@ def test_progress_becomes_log_lines_off_a_terminal(capsys):
 def test_progress_tells_the_best_that_meets_all_constraints_in_a_short_line(bound, said, capsys):
     settings = Settings(SMALL.settings.stages[:1], window=1, most_iterations=10, tolerance=0.0)
     scene = dataclasses.replace(SMALL.scene, steps=10)
-    task = Task(subject_to=AtMost(Volume(), bound))
+    task = Task(subject_to=(AtMost(Volume(), bound),))
     run = optimise(scene, settings, {}, [ProgressBar()], task=task)
     (line,) = capsys.readouterr().err.splitlines()
     found = re.search(said, line)

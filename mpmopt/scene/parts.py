@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from difflib import get_close_matches
+from inspect import signature
 from itertools import islice
 from typing import Any, ClassVar, Literal
 
-from mpmopt.errors import SceneError
+from mpmopt.errors import DesignError, SceneError
 from mpmopt.validation import count, number, share, shown
 
 Vector = tuple[float, float]
@@ -31,7 +33,25 @@ def vector(owner: str, name: str, value: Any) -> Any:
 
 
 class Checked:
-    """Sets fields of a frozen dataclass to their checked values."""
+    """Sets fields of a frozen dataclass to their checked values.
+
+    Raises
+    ------
+    SceneError
+        Or DesignError, if it is given a field that it has not.
+    """
+
+    def __new__(cls, *_: Any, **given: Any) -> Any:
+        """As any object; which fields are given is looked at."""
+        known = signature(cls.__init__).parameters if given else {}
+        for name in given:
+            if name not in known and not any(p.kind is p.VAR_KEYWORD for p in known.values()):
+                names = [each for each in known if each != "self"]
+                nearest = get_close_matches(name, names, 1)
+                cure = f"did you mean {nearest[0]}?" if nearest else f"it has {', '.join(names)}"
+                error = SceneError if cls.__module__.startswith("mpmopt.scene.") else DesignError
+                raise error(f"{cls.__name__} has no field {name}; {cure}")
+        return super().__new__(cls)
 
     def _set(self, **values: Any) -> None:
         for name, value in values.items():

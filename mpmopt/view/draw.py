@@ -291,7 +291,7 @@ def draw_history(axes: Axes, run: Optimisation) -> None:
     lines: list[Any] = axes.plot(number, objective, "k.-", ms=4, lw=1, label="objective L")
     missed = column("violation") > 0.0
     if missed.any():
-        style = {"ms": 4, "mfc": "white", "ls": "none", "label": "breaks a constraint"}
+        style: dict[str, Any] = {"ms": 4, "mfc": "white", "label": "breaks a constraint"}
         lines += axes.plot(number[missed], objective[missed], "ko", **style)
     if not np.isnan(solid).all():
         lines += axes.plot(number, solid, "C1-", lw=1, label="post-processed L")
