@@ -235,14 +235,14 @@ def test_the_command_prints_the_summary_or_an_error(tmp_path, capsys):
     cases = {"default": SMALL, "tiny": TINY}
     assert main("A case.", cases, ["--tiny", "--out", str(tmp_path)]) == 0
     printed = capsys.readouterr().out.splitlines()
-    words = ["displacement", "gain", "pieces", "chosen", "stopped", "files", "next"]
+    words = ["verdict", "displacement", "gain", "pieces", "chosen", "stopped", "files", "next"]
     assert [line.split()[0] for line in printed] == words
     assert all(len(line.split("  ")[0]) <= len("displacement") for line in printed)
     run = runfile.read_run(tmp_path / "run.h5").run
     assert run.origin == pytest.approx(13 / 64)
-    assert f"evaluation {run.chosen} of 2, stage 1 of 1, beta 0.5" in printed[3]
-    assert printed[5].endswith("report.html, run.h5, summary.json, design.png, history.png")
-    assert shlex.split(printed[6].removeprefix("next"))[:4] == [
+    assert f"evaluation {run.chosen} of 2, stage 1 of 1, beta 0.5" in printed[4]
+    assert printed[6].endswith("report.html, run.h5, summary.json, design.png, history.png")
+    assert shlex.split(printed[7].removeprefix("next"))[:4] == [
         sys.executable,
         "-m",
         "mpmopt",

@@ -36,6 +36,7 @@ def ending(path: str | os.PathLike[str]) -> str:
     best = run.result
     failed = run.failed_evaluations
     lines = {
+        **({"verdict": summary["verdict"]} if "verdict" in summary else {}),
         run.measure: _travel(run, summary),
         "gain": _gain(summary),
         **_elsewhere(summary),

@@ -8,8 +8,9 @@ import os
 from pathlib import Path
 
 from mpmopt.app.case import draw_or_warn
-from mpmopt.app.summary import table
+from mpmopt.app.summary import missed, table
 from mpmopt.assess import robustness
+from mpmopt.assess.verdict import verdict
 from mpmopt.errors import DesignError
 from mpmopt.io.files import locked, replace_file
 from mpmopt.io.notebook import Place, in_notebook
@@ -57,6 +58,7 @@ def full_study(path: str | os.PathLike[str]) -> str:
                     progress.step(f"{name}: {'failed' if math.isnan(speed) else digits(speed, 3)}")
 
                 summary |= robustness.study(problem, x, full=True, progress=show)
+            summary |= {"verdict": verdict(summary, missed(kept.run))}
             text = json.dumps(summary, indent=1) + "\n"
             replace_file(path.parent / "summary.json", text.encode())
             runfile.write(path, kept.run, summary, kept.baseline, kept.full_study)
@@ -69,5 +71,5 @@ def full_study(path: str | os.PathLike[str]) -> str:
             from mpmopt.view.gait import plot_robustness
 
             draw_or_warn(path.parent / "robustness.png", lambda at: plot_robustness(at, summary))
-    names = (*robustness.NAMES, "failures")
+    names = ("verdict", *robustness.NAMES, "failures")
     return table({name: summary[name] for name in names if name in summary})

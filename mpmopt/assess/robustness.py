@@ -54,6 +54,12 @@ NAMES = (
     "speed", "speed_by_friction", "kept", "driven_share", "after_push", "speed_by_strength",
     "speed_by_frequency", "speed_by_step", "speed_by_cells", "followed", "components",
 )  # fmt: skip
+# The trials whose share of the speed `study` tells as ``kept``.
+TRIALS = {
+    "half_step": "step 0.5", "finer_cells": "cells 2", "finest_cells": "cells 4",
+    "other_formulation": "other 2",
+}  # fmt: skip
+TOO_LONG = "particles times steps are more than"  # why a run was left out
 # Particles times steps of one run, in the short study and in the full: longer ones are left out.
 MOST_WORK, MOST_WORK_FULL = 1.5e8, 5e9
 
@@ -224,7 +230,7 @@ def speed(robot: Robot, trial: Trial, most_work: float = math.inf) -> float:
     simulation = robot.body(scene)
     work = float(simulation.initial.shape[1]) * scene.steps
     if work > most_work:
-        raise SceneError(f"{work:.1g} particles times steps are more than {most_work:.1g}")
+        raise SceneError(f"{work:.1g} {TOO_LONG} {most_work:.1g}")
     first, past = round(begin / scene.time_step), 0
     if trial.frozen:
         simulation.signal[first:] = simulation.signal[first]
@@ -411,7 +417,7 @@ def study(
         numbers = sorted((words[1] for words in names if words[0] == kind), key=float)
         return {number: speeds[f"{kind} {number}"] for number in numbers}
 
-    kept = {"half_step": share("step 0.5"), "finer_cells": share("cells 2")}
+    kept = {name: share(trial) for name, trial in TRIALS.items() if trial in speeds}
     still = share("frozen")
     found |= {
         "speed": nominal,
@@ -420,7 +426,6 @@ def study(
         "driven_share": None if still is None else 1.0 - still,
     }
     if full:
-        kept |= {"finest_cells": share("cells 4"), "other_formulation": share("other 2")}
         count = min(scene.grid.cells)
         found |= {
             "after_push": share("pushed"),
