@@ -33,10 +33,10 @@ def verdict(summary: Mapping[str, Any], missed: Sequence[str] = ()) -> str:
         Constraints that the design breaks.
     """
     studied = "speed" in summary
-    value = summary["speed"] if studied else summary["post_processed"]
+    value = summary["speed"] if studied else summary.get("post_processed")
     failures, followed = summary.get("failures", {}), summary.get("followed")
-    driven, loose = summary.get("driven_share"), summary["disconnected_particles"]
-    gain = summary["gain"].get("as designed")
+    driven, loose = summary.get("driven_share"), summary.get("disconnected_particles", 0)
+    gain = summary.get("gain", {}).get("as designed")
     if value is None:
         return f"fails: {failures.get('nominal', 'it cannot be simulated without its void')}"
     if missed:
@@ -55,7 +55,7 @@ def verdict(summary: Mapping[str, Any], missed: Sequence[str] = ()) -> str:
         return f"loose pieces: {loose} particles hang on nothing"
     what, good = ("speed", "goes") if studied else ("gain", "gains")
     least, where = 1.0, ""
-    for name, share in (summary["kept"] if studied else summary["retained_gain"]).items():
+    for name, share in summary.get("kept" if studied else "retained_gain", {}).items():
         said = name.replace("_", " ")
         if name == "twice the step" or TOO_LONG in failures.get(TRIALS.get(name, ""), ""):
             continue
