@@ -211,6 +211,8 @@ def study(path: Path) -> int:
                 return
             cells = f"{row.cells[0]} x {row.cells[1]}"
             retained = "" if np.isnan(row.retained) else f"{row.retained:9.0%}"
+            if row.halved:
+                retained += f"  (fails with a step of {row.time_step * 2**row.halved:.2g})"
             progress.print(
                 f"{row.name:<21}  {cells:>9}  {row.time_step:8.2g}  {digits(row.reference):>10}  "
                 f"{digits(row.distance):>9}  {retained}"
