@@ -119,6 +119,7 @@ def test_few_iterations_need_no_word_about_the_least():
         ),
         (Solid, {"materal": None}, SceneError, "Solid has no field materal; did you mean material"),
         (Material, {"colour": 1}, SceneError, "Material has no field colour; it has lame_lambda, "),
+        (Solid, {"lower": (0.0, 0.0)}, SceneError, "Solid: missing .* 'upper'; it has lower, upp"),
         (Stage, {"betta": 1.0}, DesignError, "Stage has no field betta; did you mean beta"),
         (Settings, {"most_iteration": 5}, DesignError, "did you mean most_iterations"),
         (Task, {"maximize": None}, DesignError, "did you mean maximise"),
@@ -126,7 +127,7 @@ def test_few_iterations_need_no_word_about_the_least():
         (Case, {"setings": None}, DesignError, "Case has no field setings; did you mean settings"),
     ],
 )
-def test_a_field_that_is_misspelt_names_the_nearest(kind, named, error, says):
+def test_a_field_that_is_misspelt_or_missing_is_named(kind, named, error, says):
     with pytest.raises(error, match=says):
         kind(**named)
 

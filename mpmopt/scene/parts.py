@@ -38,19 +38,26 @@ class Checked:
     Raises
     ------
     SceneError
-        Or DesignError, if it is given a field that it has not.
+        Or DesignError, if it is given a field that it has not, or not one that it needs.
     """
 
-    def __new__(cls, *_: Any, **given: Any) -> Any:
-        """As any object; which fields are given is looked at."""
-        known = signature(cls.__init__).parameters if given else {}
-        for name in given:
-            if name not in known and not any(p.kind is p.VAR_KEYWORD for p in known.values()):
-                names = [each for each in known if each != "self"]
-                nearest = get_close_matches(name, names, 1)
-                cure = f"did you mean {nearest[0]}?" if nearest else f"it has {', '.join(names)}"
-                error = SceneError if cls.__module__.startswith("mpmopt.scene.") else DesignError
-                raise error(f"{cls.__name__} has no field {name}; {cure}")
+    def __new__(cls, *values: Any, **given: Any) -> Any:
+        """As any object; whether what is given fits the fields is looked at."""
+        wanted = signature(cls.__init__)
+        try:
+            if values or given:  # a copy begins without
+                wanted.bind(None, *values, **given)
+        except TypeError as error:
+            names = [name for name in wanted.parameters if name != "self"]
+            says = f": {error}; it has {', '.join(names)}"
+            for name in given:
+                if name not in names:
+                    nearest = get_close_matches(name, names, 1)
+                    it_has = f"did you mean {nearest[0]}?" if nearest else says.split("; ")[1]
+                    says = f" has no field {name}; {it_has}"
+                    break
+            kind = SceneError if cls.__module__.startswith("mpmopt.scene.") else DesignError
+            raise kind(cls.__name__ + says) from None
         return super().__new__(cls)
 
     def _set(self, **values: Any) -> None:
