@@ -174,8 +174,8 @@ class Scene(Checked):
         check_size(self)
         check_walls(self)
         check_ground(self)
-        check_clamps(self)
         check_mirror(self)
+        check_clamps(self)
         check_formulation(self)
         check_stability(self)
 
