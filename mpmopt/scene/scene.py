@@ -120,7 +120,10 @@ class Scene(Checked):
         ):
             value = getattr(self, name)
             if not isinstance(value, (tuple, list)) or not all(isinstance(v, part) for v in value):
-                raise SceneError(f"Scene: {name} must be a tuple of {part.__name__} objects")
+                raise SceneError(
+                    f"Scene: {name} must be a tuple of {part.__name__} objects; a single one is "
+                    f"written {name}=(...,)"
+                )
             if any(type(v) is Region for v in value):
                 raise SceneError("Scene: a Region must be a Design, a Solid or an Actuator")
             if len(value) > MOST_PARTS:
