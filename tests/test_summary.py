@@ -143,6 +143,18 @@ def test_a_cost_of_transport_is_that_of_the_body_without_grey(told, monkeypatch)
     assert summarise(finished(low))["cost_of_transport"] == there
 
 
+def test_a_step_that_was_halved_is_told(told, monkeypatch):
+    told((0.1,) * 4, (0.5,) * 4)
+    rows: Any = summary.study
+    halved = [*rows(0, 0)[:3], dataclasses.replace(rows(0, 0)[3], time_step=1e-3, halved=1)]
+    assert "shorter_steps" not in summarise(finished())
+    monkeypatch.setattr(summary, "study", lambda problem, x: halved)
+    found = summarise(finished())
+    assert found["shorter_steps"] == {NAMES[3]: 1e-3}
+    assert "90% with half the step, " in ending._gain(found)
+    assert ending._gain(found).endswith(f"90% with {NAMES[3]} (step 0.0010)")
+
+
 def test_loose_particles_are_those_that_hang_on_nothing(told):
     told((0.1,) * 4, (0.5,) * 4)
     height = PROBLEM.particles.position[PROBLEM.particles.designed][:, 1]

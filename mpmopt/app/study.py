@@ -57,7 +57,10 @@ def full_study(path: str | os.PathLike[str]) -> str:
                 def show(name: str, speed: float) -> None:
                     progress.step(f"{name}: {'failed' if math.isnan(speed) else digits(speed, 3)}")
 
+                shorter = summary.get("shorter_steps", {})
                 summary |= robustness.study(problem, x, full=True, progress=show)
+                if shorter:  # of the refinement study too
+                    summary["shorter_steps"] = shorter | summary.get("shorter_steps", {})
             summary |= {"verdict": verdict(summary, missed(kept.run))}
             text = json.dumps(summary, indent=1) + "\n"
             replace_file(path.parent / "summary.json", text.encode())
