@@ -349,9 +349,9 @@ FINGER = {
     [
         (WALKER, {}, "goes: 90% or more of its speed"),
         (WALKER, {"followed": {"end": "goes on", "seconds": 20.0}}, "goes: .* discretisations$"),
-        (WALKER, {"followed": {"end": "falls", "seconds": 9.06}}, "falls: after 9.06"),
-        (WALKER, {"followed": {"end": "stops", "seconds": 9.06}}, "stops: after 9.06"),
-        (WALKER, {"followed": {"end": "it tore", "seconds": 9.0}}, "fails: after 9.00, it tore"),
+        (WALKER, {"followed": {"end": "falls", "seconds": 9.06}}, "falls: at t = 9.06"),
+        (WALKER, {"followed": {"end": "stops", "seconds": 9.06}}, "stops: at t = 9.06"),
+        (WALKER, {"followed": {"end": "it tore", "seconds": 9.0}}, "fails: at t = 9.00, it tore"),
         (WALKER, {"speed": None, "failures": {"nominal": "it tore"}}, "fails: it tore"),
         (WALKER, {"speed": 1e-4, "failures": {"shares": "too slow"}}, "stands: .* 0.000100"),
         (WALKER, {"driven_share": DRIVEN - 0.01}, "slides: only 49%"),

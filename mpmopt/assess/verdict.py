@@ -44,9 +44,9 @@ def verdict(summary: Mapping[str, Any], missed: Sequence[str] = ()) -> str:
     if studied and "shares" in failures:
         return f"stands: its speed along the way is {digits(value, 3)}"
     if followed and followed["end"] in ("falls", "stops"):
-        return f"{followed['end']}: after {digits(followed['seconds'], 3)}"
+        return f"{followed['end']}: at t = {digits(followed['seconds'], 3)}"
     if followed and followed["end"] != "goes on":
-        return f"fails: after {digits(followed['seconds'], 3)}, {followed['end']}"
+        return f"fails: at t = {digits(followed['seconds'], 3)}, {followed['end']}"
     if driven is not None and driven < DRIVEN:
         return f"slides: only {driven:.0%} of its speed is driven"
     if not studied and not (gain or 0.0) > 0.0:
