@@ -152,10 +152,9 @@ def plausible(draw: Any) -> dict[str, Any]:
     ground = []
     if standing == "ground":
         ground = draw(grounds(dx, bottom * dx / per_cell, mirrored))
-    clamps = []
-    if draw(st.integers(0, 3)) == 0:
-        clamps = [draw(clamp(dx, time_step, mirrored))]
     total = not walls and draw(st.booleans())
+    held = draw(st.sampled_from([0, 0, 0, 1, 1, 2]))
+    clamps = [draw(clamp(dx, time_step, mirrored, body)) for _ in range(held)]
     time_step *= 0.7 if total else 1.0
     return {
         "grid": {"cells": list(cells), "dx": dx},
@@ -198,17 +197,28 @@ def grounds(draw: Any, dx: float, bottom: float, mirrored: bool) -> list[dict[st
 
 
 @st.composite
-def clamp(draw: Any, dx: float, time_step: float, mirrored: bool) -> dict[str, Any]:
-    """A rectangle that is held, or moves by a tenth of a cell a step at most."""
+def clamp(
+    draw: Any, dx: float, time_step: float, mirrored: bool, body: list[dict[str, Any]]
+) -> dict[str, Any]:
+    """A rectangle over a corner of the body or all of a region, or anywhere.
+
+    It is held, or moves by a tenth of a cell a step at most.
+    """
     half = draw(st.sampled_from([0.5, 1.0, 2.5]))
-    height = 3.0 if mirrored else draw(st.integers(2, 5))
+    middle = [draw(st.integers(1, 3)), 3.0 if mirrored else draw(st.integers(2, 5))]
+    lower, upper = ([(m + s * half) * dx for m in middle] for s in (-1, 1))
+    if draw(st.integers(0, 3)):
+        region = draw(st.sampled_from(body))
+        more = draw(st.sampled_from([0.0, 0.3, 1.0])) * dx
+        lower, upper = ([x + s * more for x in region[e]] for s, e in ((-1, "lower"), (1, "upper")))
+        if draw(st.booleans()):  # a part of it
+            upper[0] = lower[0] + draw(st.sampled_from([0.5, 1.0, 2.0])) * dx
     path, x, y = [], 0.0, 0.0
     for k in range(draw(st.sampled_from([0, 0, 1, 3]))):
         x += draw(st.sampled_from([0.0, 0.2])) * dx
         y += 0.0 if mirrored else draw(st.sampled_from([-0.1, 0.1])) * dx
         path.append([4.0 * k * time_step, [x, y]])
-    lower, upper = (height - half) * dx, (height + half) * dx
-    return {"lower": [dx, lower], "upper": [draw(st.integers(2, 4)) * dx, upper], "path": path}
+    return {"lower": lower, "upper": upper, "path": path}
 
 
 def places(data: Any, path: tuple = ()) -> list[tuple]:

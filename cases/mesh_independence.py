@@ -1,6 +1,6 @@
 """Does the grid matter? A robot on the layer of ground and on clamped nodes, on several cells.
 
-    python cases/mesh_independence.py --out DIR [--quick]
+    python cases/mesh_independence.py --out DIR [--quick | --redraw]
 
 The robot is the walker drawn by hand: the same lines, laid out in cells of a width of 1/64, 1/128
 and 1/256. Measured are the displacement of its beam, which the objective is made of, after two
@@ -10,6 +10,7 @@ its objective is linear. Writes
 """
 
 import argparse
+import csv
 import sys
 import time
 from dataclasses import dataclass, replace
@@ -37,6 +38,12 @@ SECONDS = 2.0
 LONGEST_STEP = 8e-4  # on 64 cells; it is halved with the cells
 CELLS = (64, 128, 256)
 SHARES = (0.01, 0.05)
+# One for each choice, for the colour-blind too (P. Tol's muted and vibrant schemes).
+COLOURS = (
+    "#332288", "black", "#88CCEE", "#44AA99", "#117733", "#999933", "#DDCC77", "#CC6677", "#882255",
+    "#AA4499", "#EE7733", "#0077BB", "#999999",
+)  # fmt: skip
+MARKERS = "osv^D<>pPXh*d"
 
 
 @dataclass(frozen=True)
@@ -225,11 +232,11 @@ def plot(path: Path, rows: Rows) -> None:
 
     figure = Figure(figsize=(9.0, 4.6), layout="constrained")
     axes = figure.add_subplot()
-    for k, row in enumerate(rows):
+    for row, colour, marker in zip(rows, COLOURS, MARKERS):
         cells = [n for n in CELLS if f"{n} cells" in row]
-        marker = "os^v"[k // 10]
-        line = "k--s" if row["choice"] == "clamped nodes" else f"C{k % 10}-{marker}"
-        axes.plot(cells, [row[f"{n} cells"] for n in cells], line, label=row["choice"])
+        style = {"color": colour, "marker": marker, "label": row["choice"]}
+        style["ls"] = "--" if row["choice"] == "clamped nodes" else "-"
+        axes.plot(cells, [row[f"{n} cells"] for n in cells], **style)
     axes.set_xscale("log", base=2)
     axes.set_xticks(CELLS, [str(n) for n in CELLS])
     axes.set_xlabel("cells in a unit of length")
@@ -243,7 +250,14 @@ def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of results")
     parser.add_argument("--quick", action="store_true", help="only 64 cells, for 0.2 seconds")
+    parser.add_argument("--redraw", action="store_true", help="only the figure, of the table there")
     arguments = parser.parse_args(argv)
+    if arguments.redraw:
+        with (arguments.out / "mesh_independence.csv").open(encoding="utf-8") as file:
+            table = list(csv.DictReader(file))
+        kept = [{k: float(v) if k.endswith(" cells") else v for k, v in r.items()} for r in table]
+        plot(arguments.out / "mesh_independence.png", kept)
+        return 0
     arguments.out.mkdir(parents=True, exist_ok=True)
     rows = over_cells_and_steps(arguments.quick)
     replace_file(arguments.out / "mesh_independence.csv", as_csv(rows, 3).encode())

@@ -80,6 +80,7 @@ if TYPE_CHECKING:
     from mpmopt.scene import Solid as Solid
     from mpmopt.scene import Wall as Wall
 else:
+    __all__ = [*_HOMES]
 
     def __getattr__(name: str) -> Any:
         if name in _HOMES:

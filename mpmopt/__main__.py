@@ -102,19 +102,21 @@ def film(
     mp4: bool,
     seconds: float | None,
     forces: bool,
+    finished: bool,
     force: bool,
 ) -> int:
-    """Write a film of a run's design, the same without grey, and the solid reference design."""
+    """Write a film of a run's design beside others, or of its finished robot."""
     from mpmopt.io.files import make_folder, refuse_existing
     from mpmopt.view.film import film as filmed
 
     if mp4 and out is not None and out.suffix.lower() != ".mp4":
         raise DesignError(f"--mp4 does not write {out}: leave --mp4 out, or let FILE end in .mp4")
     run = _read(path).run
-    target = out or path.parent / ("film.mp4" if mp4 else "film.gif")
+    name = "finished" if finished else "film"
+    target = out or path.parent / f"{name}.{'mp4' if mp4 else 'gif'}"
     refuse_existing([target] if out else (), force)
     make_folder(target.parent)
-    print(f"{target}: {filmed(target, run, seconds, forces)}")
+    print(f"{target}: {filmed(target, run, seconds, forces, finished)}")
     return 0
 
 
@@ -209,6 +211,8 @@ def study(path: Path) -> int:
                 return
             cells = f"{row.cells[0]} x {row.cells[1]}"
             retained = "" if np.isnan(row.retained) else f"{row.retained:9.0%}"
+            if row.halved:
+                retained += f"  (fails with a step of {row.time_step * 2**row.halved:.2g})"
             progress.print(
                 f"{row.name:<21}  {cells:>9}  {row.time_step:8.2g}  {digits(row.reference):>10}  "
                 f"{digits(row.distance):>9}  {retained}"
@@ -437,12 +441,17 @@ def _parser() -> argparse.ArgumentParser:
         "film",
         "film its design beside the reference",
         "Write a film of the best design, the same without grey, and the solid reference\n"
-        "design with the same actuation, in slow motion. GIF needs nothing more; MP4 needs\n"
+        "design with the same actuation, in slow motion, for as long as the scene lasts; or of\n"
+        "the finished robot in the time that its speed is of. GIF needs nothing more; MP4 needs\n"
         "pip install 'mpmopt[film]'.",
         "out/walker/run.h5",
         "out/walker/run.h5 --mp4",
         "out/walker/run.h5 --seconds 12 --out walker.gif",
         "out/walker/run.h5 --forces",
+        "out/walker/run.h5 --finished",
+    )
+    command.add_argument(
+        "--finished", action="store_true", help="finished.gif: the robot at its speed, t = 2 to 8"
     )
     command.add_argument(
         "--forces", action="store_true", help="arrows: what ground and walls push bodies with"

@@ -23,7 +23,8 @@ from mpmopt.app.script import main
 from mpmopt.assess.threshold import pieces
 from mpmopt.design.one_piece import OnePiece
 from mpmopt.design.problem import Problem
-from mpmopt.design.task import Task
+from mpmopt.design.task import AtMost, Task
+from mpmopt.design.terms import Volume
 from mpmopt.design.variables import START
 from mpmopt.errors import DesignError, RunFileError, StorageError
 from mpmopt.optimisation.loop import optimise
@@ -234,14 +235,14 @@ def test_the_command_prints_the_summary_or_an_error(tmp_path, capsys):
     cases = {"default": SMALL, "tiny": TINY}
     assert main("A case.", cases, ["--tiny", "--out", str(tmp_path)]) == 0
     printed = capsys.readouterr().out.splitlines()
-    words = ["displacement", "gain", "pieces", "chosen", "stopped", "files", "next"]
+    words = ["verdict", "displacement", "gain", "pieces", "chosen", "stopped", "files", "next"]
     assert [line.split()[0] for line in printed] == words
     assert all(len(line.split("  ")[0]) <= len("displacement") for line in printed)
     run = runfile.read_run(tmp_path / "run.h5").run
     assert run.origin == pytest.approx(13 / 64)
-    assert f"evaluation {run.chosen} of 2, stage 1 of 1, beta 0.5" in printed[3]
-    assert printed[5].endswith("report.html, run.h5, summary.json, design.png, history.png")
-    assert shlex.split(printed[6].removeprefix("next"))[:4] == [
+    assert f"evaluation {run.chosen} of 2, stage 1 of 1, beta 0.5" in printed[4]
+    assert printed[6].endswith("report.html, run.h5, summary.json, design.png, history.png")
+    assert shlex.split(printed[7].removeprefix("next"))[:4] == [
         sys.executable,
         "-m",
         "mpmopt",
@@ -261,7 +262,23 @@ def test_progress_becomes_log_lines_off_a_terminal(capsys):
         "10 of 20 evaluations",
         "20 of 20 evaluations",
     ]
-    assert "displacement" in lines[0] and "non-discreteness" in lines[0]
+    assert "displacement" in lines[0] and "best" in lines[0] and "grey" in lines[0]
+
+
+@pytest.mark.parametrize(
+    ("bound", "said"), [(0.9, r"displacement (\S+), best (\S+),"), (1e-3, "none feasible, beta")]
+)
+def test_progress_tells_the_best_that_meets_all_constraints_in_a_short_line(bound, said, capsys):
+    settings = Settings(SMALL.settings.stages[:1], window=1, most_iterations=10, tolerance=0.0)
+    scene = dataclasses.replace(SMALL.scene, steps=10)
+    task = Task(subject_to=(AtMost(Volume(), bound),))
+    run = optimise(scene, settings, {}, [ProgressBar()], task=task)
+    (line,) = capsys.readouterr().err.splitlines()
+    found = re.search(said, line)
+    assert found and len(line) + 10 < 100  # a thousand evaluations, for hours
+    if found.groups():
+        values = [i.objective for i in run.history if not i.violation]
+        assert float(found[2]) == pytest.approx(max(values) - run.origin, rel=1e-2)
 
 
 def test_the_number_of_evaluations_is_known_from_the_stages(short_run):

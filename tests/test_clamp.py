@@ -399,3 +399,6 @@ def test_a_clamp_is_its_own_mirror_image():
     ):
         with pytest.raises(SceneError, match="must be its own mirror image"):
             symmetric(clamp)
+    mirror: Any = 3.0  # where it is, but no Mirror
+    with pytest.raises(SceneError, match="must be a Mirror or None"):
+        finger(mirror=mirror)

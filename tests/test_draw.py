@@ -8,7 +8,7 @@ from matplotlib.patches import Rectangle
 
 from mpmopt.assess.trajectory import Motion, optimised, reference
 from mpmopt.design.problem import Problem
-from mpmopt.scene import Grid, Scene, Solid, Wall
+from mpmopt.scene import Grid, Ground, Scene, Solid, Wall
 from mpmopt.view.draw import BLUE, RED, Squares, draw_walls, format_of, new_figure, set_view
 
 
@@ -159,3 +159,22 @@ def test_walls_are_drawn_where_bodies_rest_on_them(place, side, gravity):
 )
 def test_numbers_have_three_digits_of_their_range_in_any_unit(values, shown):
     assert [f"{value:{format_of(values)}}" for value in values] == shown
+
+
+def test_a_small_step_of_the_ground_has_a_dark_outline():
+    c = 1 / 16
+    points = ((0.0, 2 * c), (0.5, 2 * c), (0.5, 2.2 * c), (1.0, 2.2 * c))
+    scene = small_scene(walls=(), ground=(Ground(points, thickness=c),))
+    figure = new_figure(4.0, 4.0)
+    figure.set_layout_engine("none")
+    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+    set_view(axes, np.array([(0.0, 0.0), (1.0, 1.0)]))
+    draw_walls(axes, scene, moving=True)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    image = np.asarray(canvas.buffer_rgba())[::-1, :, 0]
+    size = len(image)
+    for x, y in ((0.25, 2 * c), (0.5, 2.1 * c), (0.75, 2.2 * c)):
+        i, j = round(y * size), round(x * size)
+        assert image[i - 2 : i + 3, j - 2 : j + 3].min() < 80
+        assert image[i - 8 : i - 3, j - 8 : j - 3].min() > 80 or x == 0.5

@@ -25,12 +25,18 @@ from mpmopt.errors import (
     StorageError,
 )
 from mpmopt.io.console import Interrupted
+from mpmopt.optimisation.loop import optimise
+from mpmopt.optimisation.settings import Settings, Stage
 from mpmopt.results import runfile
-from mpmopt.scene import Grid, Solid
+from mpmopt.scene import Grid, Ground, Solid
 from mpmopt.view import film as films
 from mpmopt.view.film import LAST, RATE, Screen, _mp4, film, playing_time
 
 ROOT = Path(__file__).parent.parent
+C = 1 / 16
+SHORT_ON_GROUND = Settings(
+    (Stage(4.0, time_step=2e-3),), window=1, least_iterations=1, most_iterations=1
+)
 
 
 def motions(run, count):
@@ -75,6 +81,28 @@ def test_a_film_with_forces_has_arrows(short_run, tmp_path):
     shown = Screen(motions(short_run, 5), 1.0).frame(0).shape
     assert plain[0].shape == shown
     assert pushed[0].shape != shown or np.abs(plain - pushed).max() > 100
+
+
+def test_a_film_of_the_finished_robot_shows_the_seconds_that_its_speed_is_of(tmp_path, capsys):
+    scene = small_scene(
+        walls=(), ground=(Ground.floor(3 * C, thickness=C),), steps=20, time_step=2e-3,
+        transient=0.01,
+    )  # fmt: skip
+    path = tmp_path / "run.h5"
+    runfile.write(path, optimise(scene, SHORT_ON_GROUND, Problem(scene).join(1.0, 0.3, 0.0, 0.0)))
+    assert main(["film", str(path), "--finished", "--seconds", "0.4"]) == 0
+    assert capsys.readouterr().out.rstrip().endswith("; t = 0.02 to 0.08")
+    frames, _ = gif(tmp_path / "finished.gif")
+    assert len(frames) == 10
+    assert np.abs(frames[0] - frames[-1]).max() > 100  # it moves
+    assert main(["film", str(path), "--seconds", "0.2"]) == 0
+    said = capsys.readouterr().out
+    assert "t = 0 to 0.04; the speed is that of 0.02 to 0.08 (film --finished)" in said
+
+
+def test_a_scene_without_ground_has_no_finished_robot_to_film(short_path, tmp_path, capsys):
+    assert main(["film", str(short_path), "--finished", "--out", str(tmp_path / "a.gif")]) == 1
+    assert "no actuator or no ground" in capsys.readouterr().err
 
 
 def test_bodies_are_where_their_particles_are_and_move(short_run):

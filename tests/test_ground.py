@@ -149,7 +149,17 @@ def test_json_gives_back_the_same_ground():
 
 
 def test_a_scene_says_what_it_stands_on():
-    assert "on ground from (0.0, 0.1" in str(standing(Ground.floor(2 * C, thickness=C)))
+    floor = Ground.floor(2 * C, thickness=C)
+    assert "on ground from (0.0, 0.1" in str(standing(floor))
+    for points, told in (
+        (floor.points, "level at y = 0.125 (friction"),
+        (((0.0, 0.1), (0.7, 0.1), (0.7, 0.12), (1.0, 0.12)),
+         "level at y = 0.1, a step of 0.02 up at x = 0.7, level at y = 0.12 (friction"),
+        (((0.0, 0.1), (0.7, 0.1), (1.0, -0.2)), "level at y = 0.1, falling by 45 degrees"),
+        (tuple((0.1 * k, 0.01 * (k % 2)) for k in range(9)),
+         "8 segments between y = 0 and y = 0.01"),
+    ):  # fmt: skip
+        assert told in str(standing(dataclasses.replace(floor, points=points)))
 
 
 @pytest.mark.parametrize(

@@ -16,12 +16,14 @@ from mpmopt.app.summary import summarise
 from mpmopt.assess.refinement import study
 from mpmopt.assess.threshold import solid_reference
 from mpmopt.design.problem import Problem
+from mpmopt.design.task import Task
+from mpmopt.design.terms import Speed
 from mpmopt.errors import DesignError, SceneError, SweepError
 from mpmopt.optimisation.loop import begin, check_body_fits, go_on, optimise
 from mpmopt.optimisation.presets import continuation
 from mpmopt.optimisation.settings import STAGES, Settings, Stage
 from mpmopt.results import runfile
-from mpmopt.scene import Actuator, Design, Ground, Mirror, Scene, Solid
+from mpmopt.scene import Actuator, Design, Ground, Material, Mirror, Scene, Solid
 from mpmopt.simulation.checkpoints import Checkpointing
 from mpmopt.view.live import ProgressBar
 
@@ -104,6 +106,30 @@ def test_few_iterations_need_no_word_about_the_least():
         dataclasses.replace(few, least_iterations=11)
     still = dataclasses.replace(few, tolerance=1.0, window=1, most_iterations=3)
     assert len(optimise(SCENE, still, START).history) == 3
+
+
+@pytest.mark.parametrize(
+    ("kind", "named", "error", "says"),
+    [
+        (
+            Scene,
+            {"gravty": (0.0, 0.0)},
+            SceneError,
+            "Scene has no field gravty; did you mean gravity",
+        ),
+        (Solid, {"materal": None}, SceneError, "Solid has no field materal; did you mean material"),
+        (Material, {"colour": 1}, SceneError, "Material has no field colour; it has lame_lambda, "),
+        (Solid, {"lower": (0.0, 0.0)}, SceneError, "Solid: missing .* 'upper'; it has lower, upp"),
+        (Stage, {"betta": 1.0}, DesignError, "Stage has no field betta; did you mean beta"),
+        (Settings, {"most_iteration": 5}, DesignError, "did you mean most_iterations"),
+        (Task, {"maximize": None}, DesignError, "did you mean maximise"),
+        (Speed, {"aftr": 1.0}, DesignError, "Speed has no field aftr; did you mean after"),
+        (Case, {"setings": None}, DesignError, "Case has no field setings; did you mean settings"),
+    ],
+)
+def test_a_field_that_is_misspelt_or_missing_is_named(kind, named, error, says):
+    with pytest.raises(error, match=says):
+        kind(**named)
 
 
 @pytest.mark.parametrize(

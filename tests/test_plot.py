@@ -175,6 +175,19 @@ def test_a_history_marks_each_stage_and_failure_where_it_is():
     assert marks == {0.5: r"$\beta$ = 0.5", 3.5: r"$\beta$ = 1", 4.5: r"$\beta$ = 0.5"}
 
 
+def test_a_history_marks_what_breaks_a_constraint():
+    for violation, marked in (([0.2, 0.0, np.nan], [1.0]), ([0.0, 0.0, np.nan], [])):
+        axes = draw.new_figure(7, 4).add_subplot()
+        draw.draw_history(axes, run_of(objective=[0.3, 0.2, np.nan], violation=violation))
+        lines = [line for line in axes.lines if line.get_label() == "breaks a constraint"]
+        assert [x for line in lines for x in np.asarray(line.get_xdata())] == marked
+        assert all(line.get_markerfacecolor() == "white" for line in lines)
+        legend = axes.get_legend()
+        assert legend is not None
+        names = [text.get_text() for text in legend.get_texts()]
+        assert ("breaks a constraint" in names) == bool(marked)
+
+
 def test_a_history_of_failures_alone_can_be_drawn():
     axes = draw.new_figure(7, 4).add_subplot()
     draw.draw_history(axes, run_of(objective=[np.nan, np.nan]))

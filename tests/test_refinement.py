@@ -15,7 +15,7 @@ from mpmopt.assess.refinement import study, variants, with_twice_the_step
 from mpmopt.assess.threshold import distance, retained_share
 from mpmopt.design.problem import Problem
 from mpmopt.design.variation import refined
-from mpmopt.errors import SceneError, SimulationError
+from mpmopt.errors import FractureError, SceneError, SimulationError
 from mpmopt.optimisation.loop import optimise
 from mpmopt.results import runfile
 from mpmopt.scene import Actuator, Ground
@@ -98,6 +98,36 @@ def test_what_cannot_be_simulated_says_why(monkeypatch):
     assert "made to fail" in rows["half the step"].failure
     assert np.isnan(rows["half the step"].retained)
     assert not rows["as designed"].failure
+
+
+def test_a_step_that_fails_elsewhere_is_halved_and_told(monkeypatch, short_path, capsys):
+    asked = []
+    where = [SimulationError("it inverted", 3, 1, (0.0, 0.0), "none")]
+
+    def fails(scene, *_):
+        asked.append((scene.grid.cells, scene.time_step, scene.steps))
+        if scene.time_step == 2e-3:  # half the step, and that of half the cells
+            raise where[0]
+        return 0.5 if len(asked) % 2 else 0.6
+
+    monkeypatch.setattr(refinement, "distance", fails)
+    assert main(["study", str(short_path)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line for line in lines if "fails with a step" in line] == [lines[-1]]
+    assert lines[-1].startswith("cells half as wide") and lines[-1].endswith(
+        "(fails with a step of 0.002)"
+    )
+    assert "0.001 " in lines[-1]
+    assert "half the step          no value" in lines[2]
+    assert {each for each in asked if each[0] == (32, 32)} == {
+        ((32, 32), 2e-3, 80), ((32, 32), 1e-3, 160),
+    }  # fmt: skip
+    # What tears, tears with any step.
+    where[0] = FractureError("it tore", 3, 1, (0.0, 0.0), "none")
+    asked.clear()
+    assert main(["study", str(short_path)]) == 0
+    assert "it tore" in capsys.readouterr().out.splitlines()[-1]
+    assert ((32, 32), 1e-3, 160) not in asked
 
 
 def test_a_body_without_design_is_audited_too():

@@ -41,8 +41,9 @@ SUMMARY = {
 
 @pytest.fixture(scope="module")
 def page(short_path, tmp_path_factory):
-    """The report of the short run, with a summary that others wrote."""
+    """The report of the short run, with a summary that others wrote, and a constraint missed."""
     found = runfile.read_run(short_path)
+    found.run.history[0] = dataclasses.replace(found.run.history[0], violation=0.1)
     path = tmp_path_factory.mktemp("report") / "a page.html"
     with np.errstate(all="raise", under="ignore"):
         report(path, found.run, SUMMARY, found.versions, short_path)
@@ -272,6 +273,8 @@ def test_the_page_works_in_a_real_browser(page, tmp_path):
         assert look.startswith("Evaluation 2 of 2, the chosen one")
         assert browser.js("document.querySelector('#look img').naturalWidth") == 8
         assert browser.js("past.pictures.length") == 2
+        assert browser.js("document.querySelectorAll('#history circle.open').length") == 2
+        assert "open mark" in browser.js("document.querySelector('#history').textContent")
         text = browser.js("document.body.innerText")
         for name in ("speed by friction", "thinnest member", "pieces", SUMMARY["odd"]):
             assert name in text

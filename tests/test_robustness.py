@@ -214,7 +214,7 @@ def told(monkeypatch):
 
     def tells(numbers):
         def one(robot, trial, most):
-            name = names[id(trial)]
+            name = names.get(id(trial), "with half its step")
             if name not in numbers and not name.startswith("friction"):
                 raise SimulationError("it burst", 3, -1, (0.0, 0.0), "none")
             return numbers.get(name, 0.03)
@@ -261,6 +261,25 @@ def test_a_study_tells_speeds_and_shares(told):
     few = study_of(on_ground(), full=False)
     assert list(few["kept"]) == ["half_step", "finer_cells"]
     assert "followed" not in few
+
+
+def test_a_run_on_other_cells_that_fails_is_made_again_with_half_its_step(monkeypatch):
+    scene = on_ground()
+    fine = scene.time_step / 2.0
+
+    def fails(robot, trial, most):
+        there = trial.scene()
+        if there.grid.cells == (32, 32) and there.time_step > fine / 2.0:
+            raise SimulationError("it inverted", 3, -1, (0.0, 0.0), "none")
+        if there.time_step < 0.6 * scene.time_step and there.grid.cells == (16, 16):
+            raise SimulationError("it burst", 3, -1, (0.0, 0.0), "none")
+        return 0.1
+
+    monkeypatch.setattr(robustness, "speed", fails)
+    found = study_of(scene, full=False)
+    assert found["shorter_steps"] == {"cells 2": fine / 2.0}
+    assert found["kept"] == {"half_step": None, "finer_cells": 1.0}
+    assert found["failures"] == {"step 0.5": "it burst"}
 
 
 def test_no_share_of_a_robot_that_stays_where_it_is(told):

@@ -1,6 +1,7 @@
 """What a study tells of a finished run, on numbers that are told instead of simulated."""
 
 import dataclasses
+import re
 from math import inf
 from types import SimpleNamespace
 from typing import Any
@@ -12,11 +13,13 @@ from conftest import SHORT, small_scene
 from mpmopt.app import case, ending, summary
 from mpmopt.app.case import Case
 from mpmopt.app.summary import summarise
-from mpmopt.assess import refinement, threshold
+from mpmopt.assess import refinement, robustness, threshold
 from mpmopt.assess.refinement import Variant
+from mpmopt.assess.verdict import DRIVEN, KEPT, verdict
 from mpmopt.design.objective import Objective
 from mpmopt.design.problem import Problem
-from mpmopt.design.task import DEFAULT_TASK
+from mpmopt.design.task import DEFAULT_TASK, AtMost, Task
+from mpmopt.design.terms import Volume
 from mpmopt.design.variation import refined
 from mpmopt.errors import SimulationError
 from mpmopt.optimisation import presets
@@ -138,6 +141,18 @@ def test_a_cost_of_transport_is_that_of_the_body_without_grey(told, monkeypatch)
     best = candidate(low, 0.75).x
     there = len(PROBLEM.particles.position) - 32 + threshold.kept(PROBLEM, best).sum()
     assert summarise(finished(low))["cost_of_transport"] == there
+
+
+def test_a_step_that_was_halved_is_told(told, monkeypatch):
+    told((0.1,) * 4, (0.5,) * 4)
+    rows: Any = summary.study
+    halved = [*rows(0, 0)[:3], dataclasses.replace(rows(0, 0)[3], time_step=1e-3, halved=1)]
+    assert "shorter_steps" not in summarise(finished())
+    monkeypatch.setattr(summary, "study", lambda problem, x: halved)
+    found = summarise(finished())
+    assert found["shorter_steps"] == {NAMES[3]: 1e-3}
+    assert "90% with half the step, " in ending._gain(found)
+    assert ending._gain(found).endswith(f"90% with {NAMES[3]} (step 0.0010)")
 
 
 def test_loose_particles_are_those_that_hang_on_nothing(told):
@@ -312,3 +327,57 @@ def test_the_table_at_the_end_says_what_a_number_is_of():
     assert "it stands" in ending._elsewhere(summary)["speed"]
     moved = {**summary, "failures": {}, "followed": {"end": "falls", "seconds": 9.06}}
     assert "at 9.06: falls" in ending._elsewhere(moved)["speed"]
+
+
+WALKER = {
+    "speed": 0.1, "post_processed": 0.6, "disconnected_particles": 0, "gain": {"as designed": 0.2},
+    "driven_share": 1.0, "kept": {"half_step": 0.97, "finer_cells": 0.9}, "failures": {},
+}  # fmt: skip
+FINGER = {
+    "post_processed": 0.6, "disconnected_particles": 0, "gain": {"as designed": 0.2},
+    "retained_gain": {"half the step": 0.97, "twice the step": None, "cells half as wide": 0.85},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("whole", "changes", "says"),
+    [
+        (WALKER, {}, "goes: 90% or more of its speed"),
+        (WALKER, {"followed": {"end": "goes on", "seconds": 20.0}}, "goes: .* discretisations$"),
+        (WALKER, {"followed": {"end": "falls", "seconds": 9.06}}, "falls: at t = 9.06"),
+        (WALKER, {"followed": {"end": "stops", "seconds": 9.06}}, "stops: at t = 9.06"),
+        (WALKER, {"followed": {"end": "it tore", "seconds": 9.0}}, "fails: at t = 9.00, it tore"),
+        (WALKER, {"speed": None, "failures": {"nominal": "it tore"}}, "fails: it tore"),
+        (WALKER, {"speed": 1e-4, "failures": {"shares": "too slow"}}, "stands: .* 0.000100"),
+        (WALKER, {"driven_share": DRIVEN - 0.01}, "slides: only 49%"),
+        (WALKER, {"disconnected_particles": 6}, "loose pieces: 6 particles"),
+        (WALKER, {"kept": {"half_step": KEPT - 0.01, "finer_cells": 1.0}}, "doubtful: .*half step"),
+        (WALKER, {"kept": {"half_step": KEPT, "finer_cells": 1.0}}, "goes: 80% or more"),
+        (WALKER, {"kept": {"half_step": 1.0, "finer_cells": None}}, "doubtful: no speed with fin"),
+        (
+            WALKER,
+            {
+                "kept": {"half_step": 1.0, "finer_cells": None},
+                "failures": {"cells 2": f"2e+08 {robustness.TOO_LONG} 1.5e+08"},
+            },
+            "goes: 100% or more",
+        ),
+        (FINGER, {}, "gains: 85% or more of its gain"),
+        (FINGER, {"post_processed": None}, "fails: .* without its void"),
+        (FINGER, {"gain": {"as designed": 0.0}}, "no gain"),
+        (FINGER, {"disconnected_particles": 1}, "loose pieces"),
+        (FINGER, {"retained_gain": {"half the step": 0.5}}, "doubtful: only 50% of its gain with"),
+    ],
+)
+def test_a_run_has_a_verdict_in_one_word(whole, changes, says):
+    assert re.match(says, verdict({**whole, **changes}))
+
+
+def test_a_design_that_breaks_a_constraint_has_that_as_its_verdict(told):
+    told((0.1,) * 4, (0.5,) * 4)
+    assert summarise(finished())["verdict"].startswith("gains: 90%")
+    task = Task(subject_to=(AtMost(Volume(), 0.4),))
+    run = dataclasses.replace(finished(), task=task)
+    for value, says in ((0.5, "breaks a constraint: Volume.* at most 0.4, is 0.5"), (0.4, "gains")):
+        run.best[0] = dataclasses.replace(run.best[0], constraints=(value,), multipliers=(0.0,))
+        assert re.match(says, summarise(run)["verdict"])

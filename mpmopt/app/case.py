@@ -28,6 +28,7 @@ from mpmopt.optimisation.settings import FLOORS, Settings
 from mpmopt.results import runfile
 from mpmopt.scene import Scene
 from mpmopt.scene.particles import discretise
+from mpmopt.scene.parts import Checked
 from mpmopt.scene.scene import Formulation
 from mpmopt.simulation.checkpoints import Checkpointing
 from mpmopt.validation import instance, place, shown
@@ -43,7 +44,7 @@ RESULTS = (
 
 
 @dataclass(frozen=True)
-class Case:
+class Case(Checked):
     """A scene, how to optimise it, and what an engineer would draw instead.
 
     Attributes

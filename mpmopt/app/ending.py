@@ -36,6 +36,7 @@ def ending(path: str | os.PathLike[str]) -> str:
     best = run.result
     failed = run.failed_evaluations
     lines = {
+        **({"verdict": summary["verdict"]} if "verdict" in summary else {}),
         run.measure: _travel(run, summary),
         "gain": _gain(summary),
         **_elsewhere(summary),
@@ -72,9 +73,11 @@ def _travel(run: Optimisation, summary: Mapping[str, Any]) -> str:
 
 def _gain(summary: Mapping[str, Any]) -> str:
     """Gain over the solid block, and what of it the study retains."""
-    kept = summary["retained_gain"].items()
+    kept, steps = summary["retained_gain"].items(), summary.get("shorter_steps", {})
     shares = ", ".join(
-        f"{'-' if each is None else f'{each:.0%}'} with {name}" for name, each in kept
+        f"{'-' if each is None else f'{each:.0%}'} with {name}"
+        f"{f' (step {digits(steps[name], 2)})' if name in steps else ''}"
+        for name, each in kept
     )
     return f"{_shown(summary['gain']['as designed'])} over the solid block; retained: {shares}"
 

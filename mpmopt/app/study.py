@@ -8,8 +8,9 @@ import os
 from pathlib import Path
 
 from mpmopt.app.case import draw_or_warn
-from mpmopt.app.summary import table
+from mpmopt.app.summary import missed, table
 from mpmopt.assess import robustness
+from mpmopt.assess.verdict import verdict
 from mpmopt.errors import DesignError
 from mpmopt.io.files import locked, replace_file
 from mpmopt.io.notebook import Place, in_notebook
@@ -56,7 +57,11 @@ def full_study(path: str | os.PathLike[str]) -> str:
                 def show(name: str, speed: float) -> None:
                     progress.step(f"{name}: {'failed' if math.isnan(speed) else digits(speed, 3)}")
 
+                shorter = summary.get("shorter_steps", {})
                 summary |= robustness.study(problem, x, full=True, progress=show)
+                if shorter:  # of the refinement study too
+                    summary["shorter_steps"] = shorter | summary.get("shorter_steps", {})
+            summary |= {"verdict": verdict(summary, missed(kept.run))}
             text = json.dumps(summary, indent=1) + "\n"
             replace_file(path.parent / "summary.json", text.encode())
             runfile.write(path, kept.run, summary, kept.baseline, kept.full_study)
@@ -69,5 +74,5 @@ def full_study(path: str | os.PathLike[str]) -> str:
             from mpmopt.view.gait import plot_robustness
 
             draw_or_warn(path.parent / "robustness.png", lambda at: plot_robustness(at, summary))
-    names = (*robustness.NAMES, "failures")
+    names = ("verdict", *robustness.NAMES, "failures")
     return table({name: summary[name] for name in names if name in summary})

@@ -20,9 +20,11 @@ from mpmopt.assess.threshold import (
     unactuated,
 )
 from mpmopt.assess.trajectory import post_processed as without_grey
+from mpmopt.assess.verdict import verdict
 from mpmopt.assess.width import thinnest_member
 from mpmopt.design.actuation import frequencies
 from mpmopt.design.problem import Problem
+from mpmopt.design.task import FEASIBLE
 from mpmopt.design.variables import Variables
 from mpmopt.errors import MissingLibraryError, SimulationError
 from mpmopt.optimisation.history import Optimisation
@@ -37,7 +39,7 @@ def summarise(
 ) -> dict[str, Any]:
     """Objective values (L, larger is farther), actuation and counts of a finished optimisation.
 
-    And the finished robot's `robustness.study`, in full or in short.
+    And the finished robot's `robustness.study`, in full or in short, and its `verdict`.
 
     The baseline (D,) is that of `baseline_particles`, or none.
 
@@ -59,7 +61,10 @@ def summarise(
     def numbers(values: np.ndarray) -> float | list[float]:
         return float(values[0]) if values.size == 1 else values.tolist()
 
-    return {
+    studied = robustness.study(problem, best.x, full)
+    shorter = {row.name: row.time_step for row in others if row.halved}
+    shorter |= studied.pop("shorter_steps", {})
+    found = {
         "start": _value_or_none(lambda: first.objective),
         "reference": reference,
         "baseline": None
@@ -92,7 +97,7 @@ def summarise(
             for row in rows
         },
         "retained_gain": {row.name: _number_or_none(row.retained) for row in others},
-        **robustness.study(problem, best.x, full),
+        **studied,
         "thinnest_member": _thinnest_member(problem, best.x),
         **_constraints(result),
         "non_discreteness": best.non_discreteness,
@@ -106,6 +111,14 @@ def summarise(
         "seconds": result.history[-1].seconds,
         "stop_reason": result.stop_reason,
     }
+    found |= {"shorter_steps": shorter} if shorter else {}
+    return {"verdict": verdict(found, missed(result)), **found}
+
+
+def missed(result: Optimisation) -> list[str]:
+    """The constraints that the best design breaks, with their values."""
+    pairs = zip(result.task.subject_to, result.result.constraints)
+    return [f"{each}, is {value:.4g}" for each, value in pairs if each.g(value) > FEASIBLE]
 
 
 def _thinnest_member(problem: Problem, x: NDArray[np.float64]) -> float | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,11 +14,17 @@ from mpmopt.assess import threshold
 from mpmopt.assess.threshold import distance
 from mpmopt.design.problem import Problem
 from mpmopt.design.variation import refined
-from mpmopt.errors import SceneError, SimulationError
+from mpmopt.errors import FractureError, OverlapError, SceneError, SimulationError
 from mpmopt.scene import Scene
 from mpmopt.scene.particles import discretise, nearest_designed
 from mpmopt.scene.scene import Formulation
 from mpmopt.validation import instance
+
+T = TypeVar("T")
+# How often the step is halved where a simulation with other cells, or in the other formulation,
+# fails: what was designed in one need not be stable in the other.
+HALVINGS = 2
+FINER, OTHER = OTHERWISE = "cells half as wide", "other formulation"
 
 
 @dataclass(frozen=True)
@@ -38,6 +45,8 @@ class Variant:
         Share of the gain over the reference that the design has where it was designed.
     failure : str
         Why there is no number, or empty.
+    halved : int
+        How often its step was halved because the simulation failed with a longer one.
     """
 
     name: str
@@ -47,6 +56,31 @@ class Variant:
     distance: float = np.nan
     retained: float = np.nan
     failure: str = ""
+    halved: int = 0
+
+
+def with_shorter_steps(
+    scene: Scene, simulated: Callable[[Scene], T], halvings: int = HALVINGS
+) -> tuple[T, int]:
+    """What a simulation gives, and how often the scene's step was halved until it did.
+
+    Raises
+    ------
+    SceneError, SimulationError
+        As the first that was tried.
+    """
+    first: SceneError | SimulationError | None = None
+    for halved in range(halvings + 1):
+        part = 2**halved
+        shorter = replace(scene, time_step=scene.time_step / part, steps=part * scene.steps)
+        try:
+            return simulated(shorter if halved else scene), halved
+        except (SceneError, SimulationError) as error:
+            first = first or error
+            if isinstance(error, (SceneError, FractureError, OverlapError)):  # no step mends that
+                break
+    assert first is not None
+    raise first
 
 
 def least(problem: Problem, x: NDArray[np.float64]) -> float:
@@ -84,9 +118,9 @@ def variants(scene: Scene) -> dict[str, Callable[[], Scene]]:
     longer = with_twice_the_step(scene)
     if longer is not None:
         others["twice the step"] = lambda: longer
-    others["cells half as wide"] = lambda: refined(scene, 2)
+    others[FINER] = lambda: refined(scene, 2)
     if not scene.walls:  # which one of the formulations does not know
-        others["other formulation"] = lambda: replace(scene, formulation=other_formulation(scene))
+        others[OTHER] = lambda: replace(scene, formulation=other_formulation(scene))
     return others
 
 
@@ -128,8 +162,9 @@ def study(
     -------
     list of Variant
         First as it was designed, then with half the step, twice the step where that is stable,
-        cells half as wide, and in the other formulation where the scene has no walls. What cannot
-        be simulated says why.
+        cells half as wide, and in the other formulation where the scene has no walls; these two
+        with a step halved up to `HALVINGS` times where they fail. What cannot be simulated says
+        why.
 
     Raises
     ------
@@ -140,18 +175,25 @@ def study(
     variables = problem.split(x)
     scene = problem.scene
     rows: list[Variant] = []
+
+    def simulated(there: Scene) -> tuple[float, float]:
+        keep = mapped(there, problem, x)
+        reference = distance(there, np.ones_like(keep), variables, problem.task)
+        return reference, distance(there, keep, variables, problem.task)
+
     for name, make in variants(scene).items():
         there = scene
         try:
             there = make()
-            keep = mapped(there, problem, x)
-            reference = distance(there, np.ones_like(keep), variables, problem.task)
-            row = Variant(name, there.grid.cells, there.time_step, reference)
-            design = distance(there, keep, variables, problem.task)
-            row = replace(row, distance=design)
-            gain = rows[0].distance - rows[0].reference if rows else row.distance - reference
+            # What is as designed, or has another step, has that one.
+            most = HALVINGS if name in OTHERWISE else 0
+            (reference, design), halved = with_shorter_steps(there, simulated, most)
+            gain = rows[0].distance - rows[0].reference if rows else design - reference
             retained = threshold.retained_share(scene, design - reference, gain)
-            rows.append(replace(row, retained=retained))
+            step = there.time_step / 2**halved
+            rows.append(
+                Variant(name, there.grid.cells, step, reference, design, retained, halved=halved)
+            )
         except (SceneError, SimulationError) as error:
             rows.append(Variant(name, there.grid.cells, there.time_step, failure=str(error)))
         if progress is not None:

@@ -16,7 +16,12 @@ from numpy.typing import NDArray
 from scipy.ndimage import label
 
 from mpmopt.assess import threshold
-from mpmopt.assess.refinement import other_formulation, with_twice_the_step
+from mpmopt.assess.refinement import (
+    HALVINGS,
+    other_formulation,
+    with_shorter_steps,
+    with_twice_the_step,
+)
 from mpmopt.assess.threshold import SOLID_LIMITS, solid_body
 from mpmopt.design.actuation import frequencies
 from mpmopt.design.ensemble import side_by_side
@@ -54,6 +59,12 @@ NAMES = (
     "speed", "speed_by_friction", "kept", "driven_share", "after_push", "speed_by_strength",
     "speed_by_frequency", "speed_by_step", "speed_by_cells", "followed", "components",
 )  # fmt: skip
+# The trials whose share of the speed `study` tells as ``kept``.
+TRIALS = {
+    "half_step": "step 0.5", "finer_cells": "cells 2", "finest_cells": "cells 4",
+    "other_formulation": "other 2",
+}  # fmt: skip
+TOO_LONG = "particles times steps are more than"  # why a run was left out
 # Particles times steps of one run, in the short study and in the full: longer ones are left out.
 MOST_WORK, MOST_WORK_FULL = 1.5e8, 5e9
 
@@ -203,6 +214,7 @@ class Trial(NamedTuple):
     scene: Callable[[], Scene]
     frozen: bool = False  # the actuation is held from `SETTLED` on
     pushed: bool = False
+    halvings: int = 0  # of its step, at most, where it fails
 
 
 def speed(robot: Robot, trial: Trial, most_work: float = math.inf) -> float:
@@ -224,7 +236,7 @@ def speed(robot: Robot, trial: Trial, most_work: float = math.inf) -> float:
     simulation = robot.body(scene)
     work = float(simulation.initial.shape[1]) * scene.steps
     if work > most_work:
-        raise SceneError(f"{work:.1g} particles times steps are more than {most_work:.1g}")
+        raise SceneError(f"{work:.1g} {TOO_LONG} {most_work:.1g}")
     first, past = round(begin / scene.time_step), 0
     if trial.frozen:
         simulation.signal[first:] = simulation.signal[first]
@@ -378,8 +390,9 @@ def study(
         full a quarter as wide, and half as wide in the other formulation; ``driven_share``, what is
         missing when the actuation is held; ``after_push``, the share of the speed that it has after
         a push; ``followed``, how long it goes on and what ends it; ``components``, before loose
-        pieces are dropped; and ``failures``, why a number is None. Only the components where there
-        is no ground or no actuator.
+        pieces are dropped; ``failures``, why a number is None; and ``shorter_steps``, if there are
+        any, the steps of runs with other cells or in the other formulation that fail with the step
+        that they should have. Only the components where there is no ground or no actuator.
 
     Raises
     ------
@@ -391,7 +404,7 @@ def study(
     if not can_be_studied(scene):
         return found
     most_work = MOST_WORK_FULL if full else MOST_WORK
-    speeds, failures = _speeds(robot, _trials(scene, full), most_work, progress)
+    speeds, failures, shorter = _speeds(robot, _trials(scene, full), most_work, progress)
     nominal = speeds["nominal"]
     for kind in ("cells", "step", "strength", "frequency"):
         speeds[f"{kind} 1"] = nominal
@@ -411,7 +424,7 @@ def study(
         numbers = sorted((words[1] for words in names if words[0] == kind), key=float)
         return {number: speeds[f"{kind} {number}"] for number in numbers}
 
-    kept = {"half_step": share("step 0.5"), "finer_cells": share("cells 2")}
+    kept = {name: share(trial) for name, trial in TRIALS.items() if trial in speeds}
     still = share("frozen")
     found |= {
         "speed": nominal,
@@ -420,7 +433,6 @@ def study(
         "driven_share": None if still is None else 1.0 - still,
     }
     if full:
-        kept |= {"finest_cells": share("cells 4"), "other_formulation": share("other 2")}
         count = min(scene.grid.cells)
         found |= {
             "after_push": share("pushed"),
@@ -438,7 +450,7 @@ def study(
             },
             "followed": vars(follow(robot, scene)),
         }
-    return found | {"failures": failures}
+    return found | {"failures": failures} | ({"shorter_steps": shorter} if shorter else {})
 
 
 def _trials(scene: Scene, full: bool) -> dict[str, Trial]:
@@ -446,7 +458,7 @@ def _trials(scene: Scene, full: bool) -> dict[str, Trial]:
     other = other_formulation(scene)
 
     def cells(multiple: float, formulation: Formulation | None = None) -> Trial:
-        return Trial(lambda: with_cells(scene, multiple, formulation))
+        return Trial(lambda: with_cells(scene, multiple, formulation), halvings=HALVINGS)
 
     def steps(multiple: float) -> Trial:
         return Trial(lambda: replace(scene, time_step=multiple * scene.time_step))
@@ -482,16 +494,27 @@ def _speeds(
     trials: dict[str, Trial],
     most_work: float,
     progress: Callable[[str, float], None] | None,
-) -> tuple[dict[str, float | None], dict[str, str]]:
-    """The speed of each trial, None where there is none, and why."""
+) -> tuple[dict[str, float | None], dict[str, str], dict[str, float]]:
+    """The speed of each trial, None where there is none, and why; and steps that were shortened."""
+    shorter: dict[str, float] = {}
     speeds: dict[str, float | None] = dict.fromkeys(trials)
     failures: dict[str, str] = {}
     one_at_a_time = threading.Lock()
 
     def run(name: str) -> None:
         value = math.nan
+        trial = trials[name]
+
+        def simulated(there: Scene) -> float:
+            shorter_step = trial._replace(scene=lambda: there)
+            return speed(robot, trial if there is scene else shorter_step, most_work)
+
         try:
-            value = speeds[name] = speed(robot, trials[name], most_work)
+            scene = trial.scene()
+            value, halved = with_shorter_steps(scene, simulated, trial.halvings)
+            speeds[name] = value
+            if halved:
+                shorter[name] = scene.time_step / 2**halved
         except SimulationError as error:
             failures[name] = error.what
         except SceneError as error:
@@ -501,4 +524,5 @@ def _speeds(
                 progress(name, value)
 
     side_by_side(run, list(trials))
-    return speeds, {name: failures[name] for name in trials if name in failures}
+    told = {name: failures[name] for name in trials if name in failures}
+    return speeds, told, {name: shorter[name] for name in trials if name in shorter}

@@ -15,6 +15,7 @@ from mpmopt.design.term import Adjoints, Outcome, Term
 from mpmopt.errors import DesignError
 from mpmopt.scene import Scene
 from mpmopt.scene.particles import discretise
+from mpmopt.scene.parts import Checked
 
 LEAST_CONDUCTIVITY = 1e-3  # of an edge, over that between solid particles
 NOTHING = 1e-12  # f of a design without material, so that it has a logarithm
@@ -33,7 +34,7 @@ class _Lattice(NamedTuple):
 
 
 @dataclass(frozen=True)
-class OnePiece(Term):
+class OnePiece(Term, Checked):
     """Logarithm of f, the thermal compliance of a design over that of the solid reference design.
 
     Each design particle produces heat gamma; an edge of the lattice conducts k + (1 - k) gamma_a

@@ -12,6 +12,7 @@ from mpmopt.design.step_control import LIMITS
 from mpmopt.design.task import DEFAULT_TASK, Task
 from mpmopt.errors import DesignError
 from mpmopt.scene import Scene
+from mpmopt.scene.parts import Checked
 from mpmopt.scene.scene import Formulation
 from mpmopt.simulation.checkpoints import Checkpointing
 from mpmopt.validation import count, flag, number, share, shown
@@ -33,7 +34,7 @@ def _take(owner: Any, check: Callable[..., Any], names: str, **limits: float) ->
 
 
 @dataclass(frozen=True)
-class Stage:
+class Stage(Checked):
     """What one stage of the continuation holds fixed.
 
     Attributes
@@ -134,7 +135,7 @@ STAGES = (Stage(1.0), Stage(4.0), Stage(16.0, solid=True, void_cutoff=0.05))
 
 
 @dataclass(frozen=True)
-class Settings:
+class Settings(Checked):
     """How to optimise.
 
     Attributes

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from mpmopt.scene.scene import Scene
 
 MOST_POINTS = 1000
+MOST_TOLD = 5  # segments, each of which a scene's text tells
 # Directions that differ by less, and lengths in units of the whole polyline's, are the same.
 SAME = 1e-9
 # What a layer has unless it is given (docs: theory, "Ground"): its thickness over the body's
@@ -126,6 +127,14 @@ class Ground(Checked):
         """The polyline as arrays of its segments."""
         return Line.of(np.array(self.points))
 
+    @property
+    def profile(self) -> str:
+        """Its shape in words: what each segment does, or how many there are and how high."""
+        y = [point[1] for point in self.points]
+        if len(y) > MOST_TOLD + 1:
+            return f"{len(y) - 1} segments between y = {min(y):.4g} and y = {max(y):.4g}"
+        return ", ".join(_told(*ends) for ends in pairwise(self.points))
+
     def distance(self, place: NDArray) -> tuple[NDArray, NDArray]:
         """Signed distances, positive outside, and unit normals, their gradients.
 
@@ -219,6 +228,17 @@ class Line:
                 away = s[axis] / np.where(length == 0.0, 1.0, length)
                 n[axis] = np.where(closer, np.where(flat, normal[axis], away), n[axis])
         return d, n
+
+
+def _told(start: Vector, end: Vector) -> str:
+    """What a segment does, in words."""
+    along, rise = end[0] - start[0], end[1] - start[1]
+    if abs(rise) <= SAME * abs(along):
+        return f"level at y = {start[1]:.4g}"
+    if abs(along) <= SAME * abs(rise):
+        return f"a step of {abs(rise):.4g} {'up' if rise > 0.0 else 'down'} at x = {start[0]:.4g}"
+    angle = math.degrees(math.atan2(rise, abs(along)))
+    return f"{'rising' if rise > 0.0 else 'falling'} by {abs(angle):.3g} degrees"
 
 
 def _check_line(line: Line) -> None:

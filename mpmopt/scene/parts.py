@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from difflib import get_close_matches
+from inspect import signature
 from itertools import islice
 from typing import Any, ClassVar, Literal
 
-from mpmopt.errors import SceneError
+from mpmopt.errors import DesignError, SceneError
 from mpmopt.validation import count, number, share, shown
 
 Vector = tuple[float, float]
@@ -31,7 +33,32 @@ def vector(owner: str, name: str, value: Any) -> Any:
 
 
 class Checked:
-    """Sets fields of a frozen dataclass to their checked values."""
+    """Sets fields of a frozen dataclass to their checked values.
+
+    Raises
+    ------
+    SceneError
+        Or DesignError, if it is given a field that it has not, or not one that it needs.
+    """
+
+    def __new__(cls, *values: Any, **given: Any) -> Any:
+        """As any object; whether what is given fits the fields is looked at."""
+        wanted = signature(cls.__init__)
+        try:
+            if values or given:  # a copy begins without
+                wanted.bind(None, *values, **given)
+        except TypeError as error:
+            names = [name for name in wanted.parameters if name != "self"]
+            says = f": {error}; it has {', '.join(names)}"
+            for name in given:
+                if name not in names:
+                    nearest = get_close_matches(name, names, 1)
+                    it_has = f"did you mean {nearest[0]}?" if nearest else says.split("; ")[1]
+                    says = f" has no field {name}; {it_has}"
+                    break
+            kind = SceneError if cls.__module__.startswith("mpmopt.scene.") else DesignError
+            raise kind(cls.__name__ + says) from None
+        return super().__new__(cls)
 
     def _set(self, **values: Any) -> None:
         for name, value in values.items():

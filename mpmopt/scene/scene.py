@@ -120,7 +120,10 @@ class Scene(Checked):
         ):
             value = getattr(self, name)
             if not isinstance(value, (tuple, list)) or not all(isinstance(v, part) for v in value):
-                raise SceneError(f"Scene: {name} must be a tuple of {part.__name__} objects")
+                raise SceneError(
+                    f"Scene: {name} must be a tuple of {part.__name__} objects; a single one is "
+                    f"written {name}=(...,)"
+                )
             if any(type(v) is Region for v in value):
                 raise SceneError("Scene: a Region must be a Design, a Solid or an Actuator")
             if len(value) > MOST_PARTS:
@@ -174,8 +177,8 @@ class Scene(Checked):
         check_size(self)
         check_walls(self)
         check_ground(self)
-        check_clamps(self)
         check_mirror(self)
+        check_clamps(self)
         check_formulation(self)
         check_stability(self)
 
@@ -189,8 +192,8 @@ class Scene(Checked):
             for wall in self.walls
         )
         ground = "".join(
-            f"; on ground from {ground.points[0]} to {ground.points[-1]} (friction "
-            f"{ground.friction})"
+            f"; on ground from {ground.points[0]} to {ground.points[-1]}: {ground.profile} "
+            f"(friction {ground.friction})"
             for ground in self.ground
         )
         if self.clamps:

@@ -34,8 +34,9 @@ OVERLAP = 1.15
 FAINTEST = 0.02
 # The longest arrow, over the longer side of the picture.
 LONGEST = 0.15
-# What is rigid.
+# What is rigid, and the ground's outline, of which small steps shall be seen.
 SOLID: dict[str, Any] = {"facecolor": "0.88", "edgecolor": "0.6", "hatch": "//", "lw": 0.8}
+OUTLINE: dict[str, Any] = {"fill": False, "edgecolor": "0.1", "lw": 1.3}
 
 
 @contextmanager
@@ -108,7 +109,8 @@ def draw_walls(axes: Axes, scene: Scene, moving: bool = False) -> None:
         axes.add_patch(Rectangle(corner, width, height, **SOLID))
     for ground in scene.ground:
         reach = 4.0 * (right - left + high - low)
-        axes.add_patch(Polygon(ground_outline(ground, reach), **SOLID))
+        for style in (SOLID, OUTLINE):
+            axes.add_patch(Polygon(ground_outline(ground, reach), **style))
     for clamp in scene.clamps:
         width, height = np.subtract(clamp.upper, clamp.lower)
         axes.add_patch(Rectangle(clamp.lower, width, height, fill=False, edgecolor="C1", ls="--"))
@@ -276,7 +278,10 @@ def draw_design(axes: Axes, problem: Problem, x: NDArray[np.float64]) -> None:
 
 
 def draw_history(axes: Axes, run: Optimisation) -> None:
-    """Draw objective, beta and non-discreteness over a run's evaluations, stages marked."""
+    """Draw objective, beta and non-discreteness over a run's evaluations, stages marked.
+
+    Evaluations that break a constraint are open circles.
+    """
 
     def column(name: str) -> NDArray[np.float64]:
         return np.array([getattr(item, name) for item in run.history], dtype=float)
@@ -284,6 +289,10 @@ def draw_history(axes: Axes, run: Optimisation) -> None:
     number = np.arange(1, len(run.history) + 1)
     objective, solid = column("objective"), column("post_processed")
     lines: list[Any] = axes.plot(number, objective, "k.-", ms=4, lw=1, label="objective L")
+    missed = column("violation") > 0.0
+    if missed.any():
+        style: dict[str, Any] = {"ms": 4, "mfc": "white", "label": "breaks a constraint"}
+        lines += axes.plot(number[missed], objective[missed], "ko", **style)
     if not np.isnan(solid).all():
         lines += axes.plot(number, solid, "C1-", lw=1, label="post-processed L")
     failed = np.isnan(objective)
@@ -294,9 +303,9 @@ def draw_history(axes: Axes, run: Optimisation) -> None:
     axes.set_xlabel("evaluation")
     axes.set_ylabel("objective L (distance)")
     other = axes.twinx()
-    lines += other.plot(number, column("non_discreteness"), "C0-", lw=1, label="non_discreteness")
+    lines += other.plot(number, column("non_discreteness"), "C0-", lw=1, label="non-discreteness")
     other.set_ylim(0.0, 1.05)
-    other.set_ylabel("non_discreteness")
+    other.set_ylabel("non-discreteness")
     stage, beta = column("stage"), column("beta")
     changed = np.diff(stage) != 0
     for first in [0, *(np.flatnonzero(changed) + 1)]:
@@ -307,5 +316,5 @@ def draw_history(axes: Axes, run: Optimisation) -> None:
         )  # fmt: skip
     axes.set_xlim(0.5, len(number) + 0.5)
     labels = [str(line.get_label()) for line in lines]
-    axes.legend(lines, labels, loc="upper center", ncols=4, fontsize=8, frameon=False,
+    axes.legend(lines, labels, loc="upper center", ncols=3, fontsize=8, frameon=False,
                 bbox_to_anchor=(0.5, -0.12))  # fmt: skip

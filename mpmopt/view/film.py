@@ -18,7 +18,9 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from mpmopt.assess.forces import Books, books
-from mpmopt.assess.trajectory import Motion, equal_steps, optimised, post_processed, reference
+from mpmopt.assess.robustness import SEEN, SETTLED, Robot, can_be_studied, lasting, unit
+from mpmopt.assess.trajectory import Body, Motion, optimised, post_processed, reference
+from mpmopt.design.problem import Problem
 from mpmopt.errors import DesignError, MissingLibraryError, SimulationError, StorageError
 from mpmopt.io.files import replace_file
 from mpmopt.io.progress import Progress
@@ -37,6 +39,7 @@ from mpmopt.view.draw import (
     set_view,
     view,
 )
+from mpmopt.view.gait import body_of
 
 logger = logging.getLogger(__name__)
 
@@ -49,15 +52,15 @@ DPI = 100
 BESIDE, ABOVE = 290, 560  # width in pixels of a panel beside others, and above others
 
 
-def playing_time(scene: Scene) -> float:
-    """Seconds that a film of a scene takes, so that its gait is seen."""
-    return min(max(PERIOD * periods(scene), SHORTEST), LONGEST)
+def playing_time(scene: Scene, duration: float | None = None) -> float:
+    """Seconds that a film of a scene takes, or of so much of it, so that its gait is seen."""
+    return min(max(PERIOD * periods(scene, duration), SHORTEST), LONGEST)
 
 
-def periods(scene: Scene) -> float:
-    """Periods of the fastest actuator within a scene's duration."""
+def periods(scene: Scene, duration: float | None = None) -> float:
+    """Periods of the fastest actuator within a scene's duration, or another."""
     fastest = max((actuator.angular_frequency for actuator in scene.actuators), default=0.0)
-    return scene.duration * fastest / (2.0 * math.pi)
+    return (scene.duration if duration is None else duration) * fastest / (2.0 * math.pi)
 
 
 class Screen:
@@ -177,6 +180,8 @@ class Filmed:
     per_period : float
         Frames in one period of the fastest actuator; 0 if there is none.
     bytes : int
+    time : str
+        Which simulated times those are.
     """
 
     frames: int
@@ -184,22 +189,30 @@ class Filmed:
     slow: float
     per_period: float
     bytes: int
+    time: str = ""
 
     def __str__(self) -> str:
         gait = f", {self.per_period:.0f} frames per period of the actuation"
         return (
             f"{self.frames} frames, {self.seconds:.1f} s, {self.slow:.3g} times slower"
             f"{gait if self.per_period else ''}, {self.bytes / 1e6:.3g} MB"
+            f"{self.time and f'; t = {self.time}'}"
         )
 
 
 def film(
-    path: Path, run: Optimisation, seconds: float | None = None, forces: bool = False
+    path: Path,
+    run: Optimisation,
+    seconds: float | None = None,
+    forces: bool = False,
+    finished: bool = False,
 ) -> Filmed:
     """Write a film of a run's best design, the same without grey, and the solid reference design.
 
     All have the best design's actuation. A body that cannot be simulated is left out, but for the
     best design itself.
+
+    Or of the finished robot alone, in the time that its speed is of (`robustness.speed`).
 
     Parameters
     ----------
@@ -210,11 +223,14 @@ def film(
         That the film plays; default: as long as it takes to see each period of the actuation.
     forces : bool, optional
         Draw what ground and walls push the bodies with, which takes a few seconds more.
+    finished : bool, optional
+        Film the finished robot.
 
     Raises
     ------
     DesignError
-        If the run has no design, `path` has another ending, or `seconds` makes no sense.
+        If the run has no design, `path` has another ending, `seconds` makes no sense, or there is
+        no finished robot: no actuator or no ground.
     MissingLibraryError
         If a library for the format is not installed.
     SimulationError
@@ -229,23 +245,26 @@ def film(
     if path.suffix.lower() == ".mp4":
         _ffmpeg()
     problem, x = run.problem(), run.result.x
-    scene = problem.scene
+    scene, begin = problem.scene, 0.0
+    if finished:
+        if not can_be_studied(scene):
+            raise DesignError("film: the scene has no actuator or no ground, so no finished robot")
+        begin, end = (time * unit(scene) for time in (SETTLED, SEEN))
+        scene = lasting(scene, end)
+    duration = scene.duration - begin
     if seconds is None:
-        seconds = playing_time(scene)
+        seconds = playing_time(scene, duration)
     count = round(seconds * RATE) if 0.0 < seconds <= 600.0 else 0
     if count < 2:
         raise DesignError(f"film: seconds = {seconds!r} must be from {2 / RATE:g} to 600")
-    instants = equal_steps(scene, count)
-    bodies = [optimised(problem, x)]
-    motions = [Motion.of(bodies[0], instants)]
-    for make in (post_processed, reference):
-        try:
-            body = make(problem, x)
-            motions.append(Motion.of(body, instants))
-            bodies.append(body)
-        except SimulationError as error:
-            logger.warning("the film is without a body: %s", error)
-    slow = seconds / scene.duration
+    first = round(begin / scene.time_step)
+    instants = np.rint(np.linspace(first, scene.steps, count)).astype(np.int64)
+    if finished:
+        bodies = [body_of(Robot.of(problem, x), scene)]
+        motions = [Motion.of(bodies[0], instants)]
+    else:
+        bodies, motions = _beside(problem, x, instants)
+    slow = seconds / duration
     screen = Screen(motions, slow, [books(body.simulation) for body in bodies] if forces else ())
     with Progress("frames", screen.frames) as progress:
 
@@ -256,14 +275,34 @@ def film(
 
         content = writers[path.suffix.lower()](frames())
     replace_file(path, content)
-    shown = periods(scene)
+    shown = periods(scene, duration)
     per_period = count / shown if shown else 0.0
     if 0.0 < per_period < LEAST:
         logger.warning(
             "the film has %.1f frames per period of the actuation; with %.2g seconds it has %d",
             per_period, LEAST * shown / RATE, LEAST,
         )  # fmt: skip
-    return Filmed(count, seconds + LAST, slow, per_period, len(content))
+    spans = f"{begin:g} to {begin + duration:g}"
+    if can_be_studied(scene) and not finished:
+        one = unit(problem.scene)
+        spans += f"; the speed is that of {SETTLED * one:g} to {SEEN * one:g} (film --finished)"
+    return Filmed(count, seconds + LAST, slow, per_period, len(content), spans)
+
+
+def _beside(
+    problem: Problem, x: NDArray[np.float64], instants: NDArray[np.int64]
+) -> tuple[list[Body], list[Motion]]:
+    """The best design, and others that can be simulated, with their motions."""
+    bodies = [optimised(problem, x)]
+    motions = [Motion.of(bodies[0], instants)]
+    for make in (post_processed, reference):
+        try:
+            body = make(problem, x)
+            motions.append(Motion.of(body, instants))
+            bodies.append(body)
+        except SimulationError as error:
+            logger.warning("the film is without a body: %s", error)
+    return bodies, motions
 
 
 def palette() -> Image.Image:

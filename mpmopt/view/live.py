@@ -20,7 +20,8 @@ class ProgressBar:
     """Callback of `optimise` that shows how far it is.
 
     On a terminal that is a bar; in a notebook also the best design so far and the history, below
-    it; elsewhere a line in ten evaluations.
+    it; elsewhere a line in ten evaluations. Each says what the last evaluation was and what the
+    best is that meets all constraints.
     """
 
     def __init__(self) -> None:
@@ -39,13 +40,9 @@ class ProgressBar:
             return
         if self._origin is None:
             self._origin = run.origin
-        last = run.history[-1]
         self._progress.count = len(run.history) - 1
         self._progress.total = most_evaluations(run)
-        self._progress.step(
-            f"{run.measure} {digits(last.objective - self._origin, 3)}, beta {last.beta:g}, "
-            f"non-discreteness {last.non_discreteness:.2f}"
-        )
+        self._progress.step(_said(run, self._origin))
         if time.monotonic() >= self._next:
             self._draw(run)
 
@@ -56,6 +53,16 @@ class ProgressBar:
         self._picture.show(run)
         ended = time.monotonic()
         self._next = ended + max(PAUSE, (ended - began) / SHARE)
+
+
+def _said(run: Optimisation, origin: float) -> str:
+    """The last evaluation, and the best that meets all constraints: what the run would give now."""
+    last = run.history[-1]
+    now = "failed" if last.failure else f"{run.measure} {digits(last.objective - origin, 3)}"
+    best = "none feasible"
+    if run.best and run.result.violation == 0.0:
+        best = f"best {digits(run.result.objective - origin, 3)}"
+    return f"{now}, {best}, beta {last.beta:g}, grey {last.non_discreteness:.2f}"
 
 
 def watched(callbacks: list[Any]) -> list[Any]:

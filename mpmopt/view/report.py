@@ -26,6 +26,7 @@ from PIL import Image
 
 from mpmopt.assess.feet import feet
 from mpmopt.assess.refinement import mapped
+from mpmopt.assess.robustness import SEEN, SETTLED, can_be_studied, unit
 from mpmopt.assess.trajectory import (
     Body,
     Motion,
@@ -94,6 +95,7 @@ def report(
         "scene": str(run.scene),
         "state": run.stop_reason or "Not finished.",
         "films": films,
+        "film_note": _film_note(run.scene),
         "history": _history(run),
         "designs": _designs(run),
         "tables": _tables(run, summary, versions),
@@ -102,13 +104,25 @@ def report(
             "objective and constraints": json.loads(run.task.to_json()),
             "optimisation": dataclasses.asdict(run.settings),
         },
-        "commands": _commands(source),
+        "commands": _commands(source, can_be_studied(run.scene)),
     }
     page = resources.files("mpmopt.view").joinpath("report.html").read_text(encoding="utf-8")
     # What ends a script or begins a comment there must not stand in it.
     data = json.dumps(_finite(content), separators=(",", ":")).replace("<", "\\u003c")
     page = page.replace("$NAME", html.escape(name)).replace("$DATA", data)
     replace_file(path, page.encode("utf-8", errors="backslashreplace"))
+
+
+def _film_note(scene: Scene) -> str:
+    """Which seconds the films show, and where those are that the speed is of."""
+    if not can_be_studied(scene):
+        return ""
+    one = unit(scene)
+    return (
+        f"The films end with the scene, at t = {scene.duration:.4g}. The speed in the tables is "
+        f"that of the finished robot from t = {SETTLED * one:.4g} to {SEEN * one:.4g}: mpmopt film "
+        "--finished films it (below, How to reproduce)."
+    )
 
 
 def _finite(value: Any) -> Any:
@@ -333,15 +347,18 @@ AGAIN = (
 )
 
 
-def _commands(source: Path) -> dict[str, str]:
+def _commands(source: Path, goes: bool) -> dict[str, str]:
     path = str(source.absolute())
+    film = command("-m", "mpmopt", "film", path)
+    at_speed = {"film the finished robot in the time that its speed is of": f"{film} --finished"}
     return {
         "optimise again from its first design, to the same digits": command(
             "-c", AGAIN.format(path=json.dumps(path))
         ),
         "check its gradients": command("-m", "mpmopt", "verify", path),
         "try it elsewhere, and in other discretisations": command("-m", "mpmopt", "study", path),
-        "film it": command("-m", "mpmopt", "film", path),
+        "film it": film,
+        **(at_speed if goes else {}),
         "take it out, 60 mm wide": command(
             "-m", "mpmopt", "export", path, "--svg", "--width", "60"
         ),
