@@ -2,7 +2,7 @@
 
     python cases/speed_accuracy.py --out DIR [--quick] [--peers] [--scheduler ADDRESS]
 
-Sweeps cells, Courant number, particles per cell, precision, checkpoints and formulation. The bar
+Sweeps cells, Courant number, particles per cell, precision and formulation. The bar
 has an exact answer; crawler and walker are designs given as functions of position, so that every
 resolution sees the same robot. On walls they are compared with the finest that is affordable. On
 ground with a layer there are two formulations: distances are compared with the mean of what both
@@ -53,7 +53,6 @@ from mpmopt.errors import MpmoptError, SceneError
 from mpmopt.scene import Material, Scene
 from mpmopt.scene.particles import discretise
 from mpmopt.scene.scene import Formulation
-from mpmopt.simulation.checkpoints import Checkpointing
 
 BETA = 8.0
 PATCH = 1 / 32  # gradients are compared as sums over squares of this width
@@ -135,15 +134,12 @@ class Choice:
     marker: str
     per_cell: int = 2
     precision: Literal["double", "single"] = "double"
-    memory: int = 256_000_000
     formulation: Formulation = "updated"
 
 
 PLAIN = Choice("2 x 2 a cell, double", "o")
 MORE_PARTICLES = Choice("3 x 3 a cell", "s", per_cell=3)
 SINGLE = Choice("single precision", "^", precision="single")
-LITTLE_MEMORY = Choice("64 MB of states", "v", memory=64_000_000)
-ALL_KEPT = Choice("all states kept", "P", memory=2**33)
 TOTAL = Choice("total Lagrangian", "D", formulation="total")
 SWEPT = (PLAIN.name, TOTAL.name)  # over cells and Courant numbers
 FORMULATIONS: tuple[Formulation, ...] = ("updated", "total")
@@ -218,17 +214,17 @@ class Point:
 
 def settings(quick: bool) -> list[tuple[int, float, Choice]]:
     """Cells, Courant number and choice of all points."""
-    smallest = {32: 0.1, 64: 0.1} if quick else {32: 0.05, 64: 0.05, 128: 0.05, 256: 0.2}
+    smallest = {32: 0.1, 64: 0.1} if quick else {32: 0.05, 64: 0.05, 128: 0.1, 256: 0.2}
     points = [
         (n, courant, PLAIN)
         for n, least in smallest.items()
         for courant in COURANTS
         if courant >= least
     ]
-    others = (MORE_PARTICLES, SINGLE, LITTLE_MEMORY, ALL_KEPT)
+    others = (MORE_PARTICLES, SINGLE)
     points += [(n, 0.4, choice) for n in smallest if 32 < n < 256 for choice in others]
     if not quick:
-        points += [PAPER, (256, 0.4, MORE_PARTICLES)]
+        points.append(PAPER)
         points += [(n, 0.8, SINGLE) for n in (64, 128, 256)]
     points += [(n, courant, TOTAL) for n, courant, choice in points if choice is PLAIN]
     return points
@@ -278,8 +274,7 @@ def nearest_possible(name: str, point: tuple[int, float, Choice]) -> tuple[int, 
 def measure_bar(n: int, courant: float, choice: Choice) -> Measured:
     """The bar in one discretisation."""
     bar = Bar(
-        n, courant, choice.per_cell, Checkpointing(memory=choice.memory), choice.precision,
-        formulation=choice.formulation,
+        n, courant, choice.per_cell, precision=choice.precision, formulation=choice.formulation
     )  # fmt: skip
     scene = bar.simulation.scene
     here = replace(Discretisation.of(scene), precision=choice.precision)
@@ -296,7 +291,7 @@ def measure_robot(name: str, scene: Scene, n: int, courant: float, choice: Choic
     _, phi = ROBOTS[name]
     return measure(
         scene, laid_out(scene, n, courant, choice), design(phi), BETA, PATCH,
-        checkpointing=Checkpointing(memory=choice.memory), repeats=2 if n < 256 else 1,
+        repeats=2 if n < 256 else 1,
     )  # fmt: skip
 
 
@@ -718,9 +713,7 @@ def draw(path: Path, points: Sequence[Point], known: dict[str, tuple[float, floa
     from matplotlib import pyplot as plt
     from matplotlib.lines import Line2D
 
-    markers = {
-        c.name: c.marker for c in (PLAIN, TOTAL, MORE_PARTICLES, SINGLE, LITTLE_MEMORY, ALL_KEPT)
-    }
+    markers = {c.name: c.marker for c in (PLAIN, TOTAL, MORE_PARTICLES, SINGLE)}
     markers.update({name: marker for name, (_, _, marker) in PEERS.items()})
     figure, axes = plt.subplots(3, len(TITLES), figsize=(4.9 * len(TITLES), 14.5))
     for column, (name, title) in enumerate(TITLES.items()):
