@@ -601,37 +601,37 @@ def against_peers(
             updated, total = (enough(of(mine, name, which), level) for which in FORMULATIONS)
             if updated and total:
                 wanted.append((level, updated, total))
-    # Cells that a peer's own overhead spoils are not held against it.
-    sizes = {updated: max(updated.n, 128) for _, updated, _ in wanted}
+    # Cells so few that a peer's own overhead counts are not held against it.
+    sizes = [max(updated.n, 128) for _, updated, _ in wanted]
     runs: dict[str, Callable[[], object]] = {
         label(total): several(*evaluations(total)) for _, _, total in wanted
     }
     with ExitStack() as stack:
-        own: dict[tuple[str, int], Runner] = {}
-        for module, n in itertools.product(PACED.values(), sorted(set(sizes.values()))):
-            steps = round(1000 * (128 / n) ** 2)
-            one, other = (stack.enter_context(Runner(module, n, steps)) for _ in range(2))
-            own[module, n] = one
-            runs[f"{module} {n} alone"] = partial(together, one)
-            runs[f"{module} {n} two"] = partial(together, one, other)
+        own = {
+            (module, n): [
+                stack.enter_context(Runner(module, n, round(1000 * (128 / n) ** 2)))
+                for _ in range(2)
+            ]
+            for module, n in itertools.product(PACED.values(), sorted(set(sizes)))
+        }
+        work = {which: max(runner.ready() for runner in two) for which, two in own.items()}
+        for (module, n), two in own.items():
+            runs[f"{module} {n} alone"] = partial(together, two[0])
+            runs[f"{module} {n} two"] = partial(together, *two)
         seconds = in_turns(runs, rounds)
     os.environ["MPMOPT_THREADS"] = "1"
     rows = []
-    for level, updated, total in wanted:
-        count, n, ours = particles(updated), sizes[updated], seconds[label(total)] / 2.0
+    for (level, updated, total), n in zip(wanted, sizes):
+        count, ours = particles(updated) * updated.steps, seconds[label(total)] / 2.0
         row = {
             "scene": total.scene, "off by at most": f"{100.0 * level:g} %",
             "total": f"n = {total.n}, Courant {total.courant:g}", "s": f"{np.median(ours):.3g}",
             "MLS-MPM": f"n = {updated.n}, Courant {updated.courant:g}",
-            "particles x steps": f"{count} x {updated.steps}",
+            "particles x steps": f"{count:.2g}",
         }  # fmt: skip
         for how, scenes in (("alone", 1), ("two", 2)):
             theirs = {
-                peer: seconds[f"{module} {n} {how}"]
-                / scenes
-                / own[module, n].work
-                * count
-                * updated.steps
+                peer: seconds[f"{module} {n} {how}"] / scenes * (count / work[module, n])
                 for peer, module in PACED.items()
             }
             fastest = min(theirs, key=lambda peer: float(np.median(theirs[peer])))

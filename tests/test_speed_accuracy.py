@@ -1,7 +1,9 @@
 """The chart of speed against accuracy, at tiny sizes."""
 
 import csv
+from contextlib import nullcontext
 from dataclasses import replace
+from types import SimpleNamespace
 
 import h5py
 import numpy as np
@@ -24,6 +26,7 @@ from speed_accuracy import (
 from mpmopt.assess.discretisation import Discretisation, Measured
 from mpmopt.design.problem import Problem
 from mpmopt.errors import SceneError
+from mpmopt.scene.particles import discretise
 
 BARS = (("bar", "updated"), ("bar", "total"))
 
@@ -97,6 +100,42 @@ def test_the_time_at_equal_accuracy_is_of_points_that_are_not_right_by_chance():
     assert rows["0.5 %"]["total, s"] == "8"
     assert rows["1 %"]["known to"] == "0.30%"
     assert [*rows][-1] == "0.5 %"  # what the reference itself does not know is left out
+
+
+def test_peers_take_as_long_as_the_particles_and_steps_that_mls_mpm_needs(monkeypatch):
+    def point(n, seconds, choice, scene="bar"):
+        here = Discretisation((n, n), 100, formulation=choice.formulation)
+        return Point(
+            scene, n, 100, 0.4, choice.name, Measured(here, seconds, travel=1.0), travel_error=0.04
+        )
+
+    asked = []
+
+    def runner(module, cells, steps):
+        asked.append((module, cells, steps))
+        return nullcontext(SimpleNamespace(ready=lambda: 1_000_000))
+
+    def in_turns(runs, rounds):
+        assert rounds == 3
+        seconds = {"taichi_mpm 128 alone": 2.0, "taichi_mpm 128 two": 3.0}
+        seconds |= {"warp_mpm 128 alone": 1.5, "warp_mpm 128 two": 3.6}
+        return {name: np.full(3, seconds.get(name, 0.02)) for name in runs}
+
+    monkeypatch.setattr(speed_accuracy, "Runner", runner)
+    monkeypatch.setattr(speed_accuracy, "in_turns", in_turns)
+    points = [point(32, 1.0, PLAIN), point(16, 0.5, TOTAL)]
+    rows = speed_accuracy.against_peers(points, {"bar": (0.06, 0.1)}, 3)
+    assert [row["off by at most"] for row in rows] == ["20 %", "15 %", "10 %"]
+    # 32 x 2 cells of four particles, 100 steps: at 1.5 s for a million of them, against 0.01 s.
+    assert rows[-1]["peer, alone, s"] == "0.0384, Warp"
+    assert rows[-1]["times, alone"] == "3.8"
+    assert rows[-1]["peer, two, s"] == "0.0384, Taichi"
+    assert set(asked) == {("taichi_mpm", 128, 1000), ("warp_mpm", 128, 1000)}
+    # Of a robot with a plane of symmetry they do both halves.
+    whole = speed_accuracy.particles(point(64, 1.0, PLAIN, "crawler on ground"))
+    scene = speed_accuracy.laid_out(ROBOTS["crawler on ground"][0], 64, 0.2, PLAIN)
+    half = len(discretise(scene.scene(ROBOTS["crawler on ground"][0])).position)
+    assert whole == 2 * half
 
 
 def test_a_limit_is_where_errors_of_order_two_vanish():

@@ -27,11 +27,13 @@ class Runner:
             [sys.executable, "-c", PROGRAM, str(CASES), module, str(cells), str(steps)],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1,
         )  # fmt: skip
-        self.work = 0
-        while not self.work:  # libraries greet on the same stream
-            line = self._said()
-            if line.startswith("particles "):
-                self.work = int(line.split()[1]) * steps  # particles times steps
+        self._steps = steps
+
+    def ready(self) -> int:
+        """Wait until it is compiled; particles times steps."""
+        while not (line := self._said()).startswith("particles "):
+            pass  # libraries greet on the same stream
+        return int(line.split()[1]) * self._steps
 
     def start(self) -> None:
         """Begin an evaluation."""
