@@ -16,7 +16,7 @@ from mpmopt.scene.scene import Formulation
 from stability.inversion import lumped
 from stability.safe import STRENGTH
 from stability.time_step import RESONANCES, SAFE_COURANT, SAFE_TURN
-from stability.weak import HEAVY, SAFE_STIFFNESS, SAFE_TOTAL_COURANT
+from stability.weak import HEAVY, SAFE_STIFFNESS, SAFE_TOTAL_COURANT, SAFE_TOTAL_STIFFNESS
 
 Rows = list[dict[str, Any]]
 Tables = Mapping[str, Rows]
@@ -111,10 +111,12 @@ def weak(formulation: Formulation, heavy: bool) -> Callable[[Axes, Tables], None
             colour[i, j] = max(np.nanmax([row["largest_deviation"] for row in both] + [1e-6]), 1e-6)
         image = axes.imshow(colour, cmap="YlOrBr", norm=LogNorm(1e-5, 1e-1), aspect="auto")
         if heavy:
-            least = SAFE_TOTAL_COURANT if total else SAFE_COURANT
-            wide = sum(courant <= least for courant in courants)
-            top = sum(epsilon > SAFE_STIFFNESS for epsilon in epsilons)
-            corner, size = (-0.5, top - 0.5), (wide, len(epsilons) - top)
+            most = SAFE_TOTAL_COURANT if total else SAFE_COURANT
+            least, stiffest = SAFE_TOTAL_STIFFNESS if total else (0.0, SAFE_STIFFNESS)
+            wide = sum(courant <= most for courant in courants)
+            top = sum(epsilon > 1.01 * stiffest for epsilon in epsilons)
+            high = sum(epsilon > 0.99 * least for epsilon in epsilons) - top
+            corner, size = (-0.5, top - 0.5), (wide, high)
             axes.add_patch(Rectangle(corner, *size, fill=False, ec="tab:green", lw=3, zorder=3))
         axes.set_xticks(range(len(courants)), [f"{c:g}" for c in courants], fontsize=7)
         axes.set_yticks(range(len(epsilons)), [f"{e:.0e}" for e in epsilons], fontsize=7)
@@ -226,6 +228,7 @@ def vortex(axes: Axes, tables: Tables) -> None:
     axes.set_xticks(ticks, [f"{t:g}" for t in ticks])
     axes.set_xticks([], minor=True)
     axes.set_xlim(1.15, 8.0)
+    axes.set_ylim(bottom=5e-4)  # room for the legend
     axes.set_xlabel("greatest stretch (A = 0.05 ... 1)")
     axes.set_ylabel("error / A")
     axes.set_title("Vortex, by Courant number (x: failed)")

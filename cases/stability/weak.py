@@ -23,11 +23,12 @@ from stability.time_step import block_scene, linear_limit
 
 EPSILONS = tuple(10.0**-k for k in range(1, 7))
 COURANTS = (0.14, 0.25, 0.35, 0.5, 0.6, 0.7, 0.8)
-TOTAL_COURANTS = (0.14, 0.25, 0.35, 0.5)
+TOTAL_COURANTS = (0.14, 0.25, 0.35, 0.45)
 VISCOSITY = 0.03  # of the cases in the total Lagrangian formulation
 HEAVY = 1e-2  # the void density that is the cure
 SAFE_STIFFNESS = 1e-3
-SAFE_TOTAL_COURANT = 0.35  # with a void density of ten times the void stiffness
+# In the total Lagrangian formulation, with a void density of ten times the void stiffness.
+SAFE_TOTAL_COURANT, SAFE_TOTAL_STIFFNESS = 0.35, (1e-4, 1e-3)
 GAIN = 0.25  # of an optimised walker: deviations are judged by it
 
 
