@@ -2,15 +2,16 @@
 
     python cases/speed_accuracy.py --out DIR [--quick] [--peers] [--scheduler ADDRESS]
 
-Sweeps cells, Courant number, particles per cell, precision, checkpoints and formulation. The bar
-has an exact answer; crawler and walker, on walls and on ground with a layer, are designs given as
-functions of position, so that every resolution sees the same robot, and are compared with the
-finest that is affordable in the same formulation. On ground there are both, and how far the finest
-of both are apart is a number of its own. Writes ``speed_accuracy.csv``, ``.h5`` and ``.png``, and
-the tables of the documentation, one of which has the time at equal accuracy. What
-``speed_accuracy_points.h5`` holds already is not measured again. `--peers` adds Taichi in both
-precisions and Warp at the paper's setting. The workers of a cluster must be alike, and each have a
-processor of its own: what counts is their processor time.
+Sweeps cells, Courant number, particles per cell, precision and formulation. The bar
+has an exact answer; crawler and walker are designs given as functions of position, so that every
+resolution sees the same robot. On walls they are compared with the finest that is affordable. On
+ground with a layer there are two formulations: distances are compared with the mean of what both
+tend to, extrapolated from their two finest, and gradients with the mean of the finest. Writes
+``speed_accuracy.csv``, ``.h5`` and ``.png``, and the tables of the documentation, two of which have
+the time at equal accuracy. What ``speed_accuracy_points.h5`` holds already is not measured again.
+`--peers` adds Taichi in both precisions and Warp at the paper's setting, and what the fastest of
+them would take at equal accuracy. The workers of a cluster must be alike, and each have a processor
+of its own: what counts is their processor time.
 """
 
 import argparse
@@ -18,6 +19,7 @@ import csv
 import datetime
 import importlib
 import importlib.metadata
+import itertools
 import json
 import math
 import os
@@ -25,7 +27,9 @@ import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -34,10 +38,11 @@ import h5py
 import numpy as np
 import peers
 import walker
-from benchmark import processor
+from benchmark import in_turns, processor, ratio, several
 from exact import Bar, manufactured_error
 from matplotlib.artist import Artist
 from matplotlib.patches import Rectangle
+from peers.pace import Runner, together
 
 from mpmopt.app.sweeps import connected, results, sweep
 from mpmopt.assess.discretisation import Discretisation, Measured, density, measure, timed
@@ -46,8 +51,8 @@ from mpmopt.design.objective import Objective
 from mpmopt.design.problem import Problem
 from mpmopt.errors import MpmoptError, SceneError
 from mpmopt.scene import Material, Scene
+from mpmopt.scene.particles import discretise
 from mpmopt.scene.scene import Formulation
-from mpmopt.simulation.checkpoints import Checkpointing
 
 BETA = 8.0
 PATCH = 1 / 32  # gradients are compared as sums over squares of this width
@@ -78,7 +83,8 @@ def crawler_phi(position: np.ndarray) -> np.ndarray:
     return legs(np.min(lines, axis=0), 2 * C, 0.8)
 
 
-DURATION = 0.5  # two and a half strokes; gradients over longer times have no limit
+# A stroke and a quarter between walls, two and a half on ground: as long as gradients have a limit.
+WALLED, DURATION = 0.25, 0.5
 
 
 def lasting(scene: Scene, duration: float) -> Scene:
@@ -100,8 +106,8 @@ def walker_phi_on_ground(position: np.ndarray) -> np.ndarray:
 
 # The paper's cells and step.
 ROBOTS: dict[str, tuple[Scene, Callable[[np.ndarray], np.ndarray]]] = {
-    "walker": (lasting(walker.walker(128, 2e-4).vary(**FLOORS), DURATION), walker_phi),
-    "crawler": (lasting(crawler.crawler(128, 2e-4).vary(**FLOORS), DURATION), crawler_phi),
+    "walker": (lasting(walker.walker(128, 2e-4).vary(**FLOORS), WALLED), walker_phi),
+    "crawler": (lasting(crawler.crawler(128, 2e-4).vary(**FLOORS), WALLED), crawler_phi),
     "walker on ground": (
         on_ground(walker.walker_on_ground(128, 2e-4, 2.0)),
         walker_phi_on_ground,
@@ -128,17 +134,16 @@ class Choice:
     marker: str
     per_cell: int = 2
     precision: Literal["double", "single"] = "double"
-    memory: int = 256_000_000
     formulation: Formulation = "updated"
 
 
 PLAIN = Choice("2 x 2 a cell, double", "o")
 MORE_PARTICLES = Choice("3 x 3 a cell", "s", per_cell=3)
 SINGLE = Choice("single precision", "^", precision="single")
-LITTLE_MEMORY = Choice("64 MB of states", "v", memory=64_000_000)
-ALL_KEPT = Choice("all states kept", "P", memory=2**33)
 TOTAL = Choice("total Lagrangian", "D", formulation="total")
 SWEPT = (PLAIN.name, TOTAL.name)  # over cells and Courant numbers
+FORMULATIONS: tuple[Formulation, ...] = ("updated", "total")
+PACED = {"Taichi": "taichi_mpm", "Warp": "warp_mpm"}  # JAX is slower
 PEERS = {
     "Taichi, double": ("taichi_mpm", "taichi", "*"),
     "Taichi, single": ("taichi_mpm", "taichi", "h"),
@@ -209,17 +214,17 @@ class Point:
 
 def settings(quick: bool) -> list[tuple[int, float, Choice]]:
     """Cells, Courant number and choice of all points."""
-    smallest = {32: 0.1, 64: 0.1} if quick else {32: 0.05, 64: 0.05, 128: 0.05, 256: 0.2}
+    smallest = {32: 0.1, 64: 0.1} if quick else {32: 0.05, 64: 0.05, 128: 0.1, 256: 0.2}
     points = [
         (n, courant, PLAIN)
         for n, least in smallest.items()
         for courant in COURANTS
         if courant >= least
     ]
-    others = (MORE_PARTICLES, SINGLE, LITTLE_MEMORY, ALL_KEPT)
+    others = (MORE_PARTICLES, SINGLE)
     points += [(n, 0.4, choice) for n in smallest if 32 < n < 256 for choice in others]
     if not quick:
-        points += [PAPER, (256, 0.4, MORE_PARTICLES)]
+        points.append(PAPER)
         points += [(n, 0.8, SINGLE) for n in (64, 128, 256)]
     points += [(n, courant, TOTAL) for n, courant, choice in points if choice is PLAIN]
     return points
@@ -228,8 +233,12 @@ def settings(quick: bool) -> list[tuple[int, float, Choice]]:
 COURANTS = (0.05, 0.1, 0.2, 0.3, 0.4, 0.6, 0.8)
 PAPER = (128, ROBOTS["walker"][0].courant, PLAIN)
 RECOMMENDED = (128, 0.6, PLAIN)
-# The reference is at the Courant number of the recommended setting.
+# On walls the reference is at the Courant number of the recommended setting.
 REFERENCE, QUICK_REFERENCE = (384, 0.6, PLAIN), (128, 0.6, PLAIN)
+# On ground it is extrapolated from two, at a Courant number that viscosity bears on the finest:
+# above it MLS-MPM's forward run still looks sound, but its gradient grows without limit.
+LIMITS, QUICK_LIMITS, LIMIT_COURANT = (128, 256, 384), (32, 64, 128), 0.2
+ORDER = 2  # of both formulations on ground, in cells and step together
 
 
 def is_possible(name: str, n: int, courant: float, choice: Choice) -> bool:
@@ -265,8 +274,7 @@ def nearest_possible(name: str, point: tuple[int, float, Choice]) -> tuple[int, 
 def measure_bar(n: int, courant: float, choice: Choice) -> Measured:
     """The bar in one discretisation."""
     bar = Bar(
-        n, courant, choice.per_cell, Checkpointing(memory=choice.memory), choice.precision,
-        formulation=choice.formulation,
+        n, courant, choice.per_cell, precision=choice.precision, formulation=choice.formulation
     )  # fmt: skip
     scene = bar.simulation.scene
     here = replace(Discretisation.of(scene), precision=choice.precision)
@@ -283,7 +291,7 @@ def measure_robot(name: str, scene: Scene, n: int, courant: float, choice: Choic
     _, phi = ROBOTS[name]
     return measure(
         scene, laid_out(scene, n, courant, choice), design(phi), BETA, PATCH,
-        checkpointing=Checkpointing(memory=choice.memory), repeats=2 if n < 256 else 1,
+        repeats=2 if n < 256 else 1,
     )  # fmt: skip
 
 
@@ -422,10 +430,15 @@ def print_peer(name: str, robot: str) -> None:
 def horizons(bench: Bench) -> list[dict[str, str]]:
     """How the gradient's error grows with the simulated time: n = 64 and 128 against 256."""
     finest = {
-        robot: nearest_possible(
-            robot[0], (*REFERENCE[:2], PLAIN if robot[1] == "updated" else TOTAL)
+        (name, formulation): nearest_possible(
+            name,
+            (
+                256,
+                LIMIT_COURANT if ROBOTS[name][0].ground else REFERENCE[1],
+                PLAIN if formulation == "updated" else TOTAL,
+            ),
         )
-        for robot in robots()
+        for name, formulation in robots()
     }
     where = [(robot, duration) for robot in finest for duration in (0.25, 0.5, 1.0)]
     cells = (64, 128, 256)
@@ -443,9 +456,8 @@ def horizons(bench: Bench) -> list[dict[str, str]]:
         }  # fmt: skip
         for n, one in ((64, coarse), (128, middle)):
             travel, gradient, angle = one.errors(fine)
-            row[f"travel, n = {n}"] = f"{travel:.0%}"
-            row[f"gradient, n = {n}"] = f"{gradient:.0%}"
-            row[f"angle, n = {n}"] = f"{angle:.0f}"
+            row[f"distance, n = {n}"] = f"{travel:.0%}"
+            row[f"gradient, n = {n}"] = f"{gradient:.0%}, {angle:.0f} deg"
         rows.append(row)
     return rows
 
@@ -485,16 +497,19 @@ def travels(points: Sequence[Point]) -> list[dict[str, str]]:
 
 def robots() -> list[tuple[str, Formulation]]:
     """Robots, in all formulations that their scenes allow."""
-    both: tuple[Formulation, ...] = ("updated", "total")
     return [
         (name, formulation)
         for name, (scene, _) in ROBOTS.items()
-        for formulation in both
+        for formulation in FORMULATIONS
         if formulation == "updated" or not scene.walls
     ]
 
 
-def enough(points: Sequence[Point], error: float) -> Point | None:
+ERRORS = {"distance": "travel_error", "gradient": "gradient_error"}
+LEVELS = (0.2, 0.15, 0.1, 0.05, 0.02, 0.01, 0.005, 0.001)
+
+
+def enough(points: Sequence[Point], level: float, error: str = "travel_error") -> Point | None:
     """The fastest of some points that is off by at most so much, and not by chance.
 
     The same with finer cells must be so too, as in `discretisation.cheapest`.
@@ -502,8 +517,8 @@ def enough(points: Sequence[Point], error: float) -> Point | None:
     own = [p for p in points if p.choice not in PEERS and p.measured.seconds > 0.0]
 
     def reached(point: Point) -> bool:
-        return point.travel_error <= error and all(
-            other.travel_error <= error
+        return getattr(point, error) <= level and all(
+            getattr(other, error) <= level
             for other in own
             if other.n > point.n and (other.courant, other.choice) == (point.courant, point.choice)
         )
@@ -511,33 +526,118 @@ def enough(points: Sequence[Point], error: float) -> Point | None:
     return min(filter(reached, own), key=lambda p: p.measured.seconds, default=None)
 
 
-def at_equal_accuracy(points: Sequence[Point], apart: dict[str, float]) -> list[dict[str, str]]:
-    """What a distance costs in both formulations, to accuracies that both agree on."""
+def of(points: Sequence[Point], scene: str, formulation: Formulation) -> list[Point]:
+    """Those of a scene in a formulation."""
+    return [p for p in points if (p.scene, p.formulation) == (scene, formulation)]
+
+
+def at_equal_accuracy(
+    points: Sequence[Point], apart: dict[str, tuple[float, float]]
+) -> list[dict[str, str]]:
+    """What a distance and a gradient cost in both formulations, to accuracies that are known."""
     rows = []
-    for name in apart:
-        for error in (0.2, 0.15, 0.1, 0.05, 0.02, 0.01, 0.005, 0.001):
-            if error < apart[name]:
-                break
-            row = {"scene": name, "off by at most": f"{100.0 * error:g} %"}
-            found = []
-            for formulation in ("updated", "total"):
-                best = enough(
-                    [p for p in points if (p.scene, p.formulation) == (name, formulation)], error
-                )
-                found.append(best)
-                row[formulation] = (
-                    f"n = {best.n}, Courant {best.courant:g}, {best.choice}" if best else "none"
-                )
-                row[f"{formulation}, s"] = f"{best.measured.seconds:.3g}" if best else ""
-            updated, total = found
-            row["times"] = (
-                f"{updated.measured.seconds / total.measured.seconds:.1f}"
-                if updated and total
-                else ""
-            )
-            row["references apart"] = f"{apart[name]:.1%}"
-            if updated or total:
-                rows.append(row)
+    for name, known in apart.items():
+        for (what, error), least in zip(ERRORS.items(), known):
+            for level in LEVELS:
+                if level < least:
+                    break
+                row = {"scene": name, "of the": what, "off by at most": f"{100.0 * level:g} %"}
+                found = {}
+                for formulation in FORMULATIONS:
+                    best = enough(of(points, name, formulation), level, error)
+                    found[formulation] = best.measured.seconds if best else math.nan
+                    row[formulation] = (
+                        f"n = {best.n}, Courant {best.courant:g}, {best.choice}" if best else "none"
+                    )
+                    row[f"{formulation}, s"] = f"{found[formulation]:.3g}" if best else ""
+                times = found["updated"] / found["total"]
+                row["times"] = f"{times:.1f}" if math.isfinite(times) else ""
+                row["known to"] = f"{least:.2%}"
+                if any(map(math.isfinite, found.values())):
+                    rows.append(row)
+    return rows
+
+
+def evaluations(point: Point) -> list[Callable[[], object]]:
+    """Two that may run side by side, of what a point is."""
+    if point.scene == "bar":
+        bars = [Bar(point.n, point.courant, formulation=point.formulation) for _ in range(2)]
+        return [bar.value_and_gradient for bar in bars]
+    scene, phi = ROBOTS[point.scene]
+    choice = PLAIN if point.formulation == "updated" else TOTAL
+    here = laid_out(scene, point.n, point.courant, choice)
+    problems = [here.problem(scene, BETA, limits=None) for _ in range(2)]
+    return [partial(problem.evaluate, design(phi)(problem)) for problem in problems]
+
+
+def label(point: Point) -> str:
+    """What is told of it beside the scene's other points."""
+    return f"{point.scene}, n = {point.n}, Courant {point.courant:g}, {point.formulation}"
+
+
+def particles(point: Point) -> int:
+    """Of the whole body: peers know no plane of symmetry."""
+    if point.scene == "bar":
+        return Bar(point.n, point.courant).simulation.initial.shape[1]
+    scene = laid_out(ROBOTS[point.scene][0], point.n, point.courant, PLAIN)
+    return len(discretise(replace(scene.scene(ROBOTS[point.scene][0]), mirror=None)).position)
+
+
+def against_peers(
+    points: Sequence[Point], apart: dict[str, tuple[float, float]], rounds: int
+) -> list[dict[str, str]]:
+    """How many times as long as ours in total Lagrangian the fastest peer takes at equal accuracy.
+
+    Peers do MLS-MPM and compute our numbers to 1e-13, so they need the cells and steps that ours
+    needs in double precision. What they take for a particle and step is measured with the paper's
+    walker on such cells, as they know no ground with a layer. All is elapsed time on all
+    processors: two scenes side by side in total Lagrangian, the peer alone, and two of the peer
+    side by side.
+    """
+    wanted = []
+    for name, (least, _) in apart.items():
+        mine = [p for p in points if p.scene == name and p.choice in SWEPT]
+        for level in (level for level in LEVELS if level >= least):
+            updated, total = (enough(of(mine, name, which), level) for which in FORMULATIONS)
+            if updated and total:
+                wanted.append((level, updated, total))
+    # Cells so few that a peer's own overhead counts are not held against it.
+    sizes = [max(updated.n, 128) for _, updated, _ in wanted]
+    runs: dict[str, Callable[[], object]] = {
+        label(total): several(*evaluations(total)) for _, _, total in wanted
+    }
+    with ExitStack() as stack:
+        own = {
+            (module, n): [
+                stack.enter_context(Runner(module, n, round(1000 * (128 / n) ** 2)))
+                for _ in range(2)
+            ]
+            for module, n in itertools.product(PACED.values(), sorted(set(sizes)))
+        }
+        work = {which: max(runner.ready() for runner in two) for which, two in own.items()}
+        for (module, n), two in own.items():
+            runs[f"{module} {n} alone"] = partial(together, two[0])
+            runs[f"{module} {n} two"] = partial(together, *two)
+        seconds = in_turns(runs, rounds)
+    os.environ["MPMOPT_THREADS"] = "1"
+    rows = []
+    for (level, updated, total), n in zip(wanted, sizes):
+        count, ours = particles(updated) * updated.steps, seconds[label(total)] / 2.0
+        row = {
+            "scene": total.scene, "off by at most": f"{100.0 * level:g} %",
+            "total": f"n = {total.n}, Courant {total.courant:g}", "s": f"{np.median(ours):.3g}",
+            "MLS-MPM": f"n = {updated.n}, Courant {updated.courant:g}",
+            "particles x steps": f"{count:.2g}",
+        }  # fmt: skip
+        for how, scenes in (("alone", 1), ("two", 2)):
+            theirs = {
+                peer: seconds[f"{module} {n} {how}"] / scenes * (count / work[module, n])
+                for peer, module in PACED.items()
+            }
+            fastest = min(theirs, key=lambda peer: float(np.median(theirs[peer])))
+            row[f"peer, {how}, s"] = f"{np.median(theirs[fastest]):.3g}, {fastest}"
+            row[f"times, {how}"] = f"{ratio(theirs[fastest], ours):.1f}"
+        rows.append(row)
     return rows
 
 
@@ -613,9 +713,7 @@ def draw(path: Path, points: Sequence[Point], known: dict[str, tuple[float, floa
     from matplotlib import pyplot as plt
     from matplotlib.lines import Line2D
 
-    markers = {
-        c.name: c.marker for c in (PLAIN, TOTAL, MORE_PARTICLES, SINGLE, LITTLE_MEMORY, ALL_KEPT)
-    }
+    markers = {c.name: c.marker for c in (PLAIN, TOTAL, MORE_PARTICLES, SINGLE)}
     markers.update({name: marker for name, (_, _, marker) in PEERS.items()})
     figure, axes = plt.subplots(3, len(TITLES), figsize=(4.9 * len(TITLES), 14.5))
     for column, (name, title) in enumerate(TITLES.items()):
@@ -758,32 +856,21 @@ def chart(path: Path, bench: Bench, quick: bool, peers: bool) -> None:
     references: dict[tuple[str, Formulation], Measured] = {
         ("bar", "updated"): exact_bar(), ("bar", "total"): exact_bar(),
     }  # fmt: skip
-    best = {
-        (name, formulation): nearest_possible(
-            name, (*finest[:2], PLAIN if formulation == "updated" else TOTAL)
-        )
-        for name, formulation in robots()
-    }
-    measured = bench.measure([(robot[0], *point) for robot, point in best.items()])
-    references |= dict(zip(best, measured))
-    known: dict[tuple[str, Formulation], tuple[float, float]] = {
-        ("bar", "updated"): (0.0, 0.0), ("bar", "total"): (0.0, 0.0),
-    }  # fmt: skip
-    apart = {"bar": 0.0}
-    for (name, formulation), (_, courant, choice) in best.items():
-        same = [p for p in points if (p.scene, p.choice) == (name, choice.name)]
-        next_best = min(same, key=lambda p: (-p.n, abs(p.courant - courant)))
-        travel, gradient, _ = next_best.measured.errors(references[name, formulation])
-        known[name, formulation] = travel, gradient
-        if formulation == "total":
-            differ = references[name, "total"].errors(references[name, "updated"])
-            apart[name] = differ[0]
-            print(
-                f"{name}: references of both formulations {differ[0]:.2%} of travel and "
-                f"{differ[1]:.1%} of the gradient apart"
-            )
+    known = {"bar": (0.0, 0.0)}  # how far a reference may be off: distance and gradient
+    walled = [name for name, (scene, _) in ROBOTS.items() if not scene.ground]
+    for name in walled:
+        at = nearest_possible(name, finest)
+        (references[name, "updated"],) = bench.measure([(name, *at)])
+        same = [p for p in points if (p.scene, p.choice) == (name, PLAIN.name)]
+        next_best = min(same, key=lambda p: (-p.n, abs(p.courant - at[1])))
+        known[name] = next_best.measured.errors(references[name, "updated"])[:2]
+    tends = limits(bench, quick)
+    for name in dict.fromkeys(name for name, _ in tends):
+        both = [tends[name, which].extrapolated for which in FORMULATIONS]
+        references[name, "updated"] = references[name, "total"] = mean(*both)
+        apart, *_ = both[0].errors(mean(*both))
+        known[name] = apart, max(tends[name, which].gradient_left for which in FORMULATIONS)
     if peers:  # they know walls
-        walled = [name for name, (scene, _) in ROBOTS.items() if not scene.ground]
         points += [peer_point(name, robot) for robot in walled for name in PEERS]
     points = [p.against(references[p.scene, p.formulation]) for p in points]
     write_csv(Path(f"{path}.csv"), [p.row() for p in points])
@@ -792,23 +879,93 @@ def chart(path: Path, bench: Bench, quick: bool, peers: bool) -> None:
         p for name in TITLES for p in front([q for q in points if q.scene == name], "travel_error")
     ]
     write_csv(Path(f"{path}_front.csv"), [p.row() for p in fronts])
-    write_csv(Path(f"{path}_equal.csv"), at_equal_accuracy(points, apart))
+    on_both = {name: known[name] for name in known if name not in walled}
+    write_csv(Path(f"{path}_equal.csv"), at_equal_accuracy(points, on_both))
+    write_csv(Path(f"{path}_limits.csv"), [tends[each].row(references[each]) for each in tends])
+    if peers:
+        rounds = 3 if quick else 5
+        write_csv(Path(f"{path}_peers.csv"), against_peers(points, on_both, rounds))
     if not quick:
         write_csv(Path(f"{path}_horizon.csv"), horizons(bench))
         write_csv(Path(f"{path}_manufactured.csv"), manufactured())
     write_h5(Path(f"{path}.h5"), points, references)
-    unknown = {
-        scene: (max(v[0] for k, v in known.items() if k[0] == scene),
-                max(v[1] for k, v in known.items() if k[0] == scene))
-        for scene in TITLES
-    }  # fmt: skip
-    draw(Path(f"{path}.png"), points, unknown)
+    draw(Path(f"{path}.png"), points, known)
     print(machine())
-    for (scene, which), (travel, gradient) in known.items():
-        print(
-            f"{scene}, {which}: reference known to {travel:.1%} of travel, "
-            f"{gradient:.0%} of the gradient"
-        )
+    for scene, (travel, gradient) in known.items():
+        print(f"{scene}: reference known to {travel:.2%} of travel, {gradient:.1%} of the gradient")
+
+
+@dataclass(frozen=True)
+class Limit:
+    """What a robot on ground tends to in one formulation.
+
+    Attributes
+    ----------
+    scene : str
+    formulation : "updated" or "total"
+    courant : float
+    cells : tuple of int
+        Three, the finest last.
+    measured : tuple of Measured
+        With these cells.
+    """
+
+    scene: str
+    formulation: Formulation
+    courant: float
+    cells: tuple[int, ...]
+    measured: tuple[Measured, ...]
+
+    @property
+    def extrapolated(self) -> Measured:
+        """The finest, with the distance that it and the next tend to (Richardson 1911)."""
+        _, middle, fine = self.measured
+        return replace(fine, travel=fine.travel + self._left * (fine.travel - middle.travel))
+
+    @property
+    def gradient_left(self) -> float:
+        """About how far the finest gradient is from where it tends to, as a share."""
+        _, middle, fine = self.measured
+        return self._left * middle.errors(fine)[1]
+
+    @property
+    def _left(self) -> float:
+        """What the next step of an error that falls with `ORDER` is of the last one."""
+        return 1.0 / ((self.cells[-1] / self.cells[-2]) ** ORDER - 1.0)
+
+    def row(self, reference: Measured) -> dict[str, str]:
+        """One line of the table of limits, against the mean of both formulations'."""
+        row = {"scene": self.scene, "formulation": self.formulation}
+        row["Courant"] = f"{self.courant:g}"
+        for n, one in zip(self.cells, self.measured):
+            row[f"distance, n = {n}"] = f"{one.travel:.5f}"
+        row["limit"] = f"{self.extrapolated.travel:.5f}"
+        for n, one in zip(self.cells, self.measured):
+            _, gradient, angle = one.errors(reference)
+            row[f"gradient off by, n = {n}"] = f"{gradient:.1%}, {angle:.1f} deg"
+        return row
+
+
+def limits(bench: Bench, quick: bool) -> dict[tuple[str, Formulation], Limit]:
+    """Those of all robots on ground."""
+    cells, found = QUICK_LIMITS if quick else LIMITS, {}
+    for name, formulation in robots():
+        if not ROBOTS[name][0].ground:
+            continue
+        choice = PLAIN if formulation == "updated" else TOTAL
+        _, courant, _ = nearest_possible(name, (cells[-1], LIMIT_COURANT, choice))
+        measured = bench.measure([(name, n, courant, choice) for n in cells])
+        found[name, formulation] = Limit(name, formulation, courant, cells, tuple(measured))
+    return found
+
+
+def mean(one: Measured, other: Measured) -> Measured:
+    """Halfway between two."""
+    return replace(
+        one,
+        travel=0.5 * (one.travel + other.travel),
+        gradient=0.5 * (one.gradient + other.gradient),
+    )
 
 
 def exact_bar() -> Measured:

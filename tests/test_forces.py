@@ -150,6 +150,41 @@ def test_forces_are_what_changes_the_momentum_of_a_lattice():
     assert unexplained(found) <= 1e-3
 
 
+def colliding(time_step=1e-3, mirror=None):
+    """Two blocks that slide on a floor against each other."""
+    simulation = falling(
+        body=tuple(Solid((x, 4 * C), (x + 3 * C, 7 * C)) for x in (3 * C, 10 * C)),
+        ground=(Ground.floor(3.25 * C, friction=0.4, thickness=C),),
+        time_step=time_step, steps=round(0.1 / time_step), mirror=mirror, direction=(0.0, 1.0),
+    )  # fmt: skip
+    x = simulation.start[0]
+    simulation.start[2] = np.where(simulation.lattice.mass > 0.0, 4.0 * np.sign(8 * C - x), 0.0)
+    return simulation
+
+
+@pytest.mark.parametrize("mirror", [None, Mirror("x", 8 * C)])
+def test_the_books_of_blocks_that_collide_close(mirror):
+    coarse, fine = (books(colliding(dt, mirror)) for dt in (1e-3, 5e-4))
+    stored = coarse.energy["self-contact"]
+    assert stored[0] == 0.0
+    assert stored.max() > 0.1 * coarse.energy["kinetic"][0]
+    assert unexplained(coarse) <= 3e-3
+    assert np.abs(fine.residual).max() <= 0.35 * np.abs(coarse.residual).max()
+    assert coarse.work["friction"][-1] < -1e-3 * coarse.turnover
+
+
+def test_blocks_that_collide_give_the_ground_nothing_of_what_they_give_each_other():
+    simulation = colliding()
+    simulation.start[1, simulation.start[0] > 8 * C] += C  # one block flies
+    found, m = books(simulation), simulation.lattice.mass
+    states = np.array(list(simulation.node_states()))
+    momentum = states[:, 2:] @ m
+    weight = m.sum() * np.array([0.0, -10.0])
+    given = simulation.scene.time_step * (found.force[:, 0] + weight)
+    assert np.diff(momentum, axis=0) == pytest.approx(given, abs=1e-12)
+    assert found.energy["self-contact"].max() > 0.1 * found.energy["kinetic"][0]
+
+
 def test_the_books_of_a_lattice_with_a_mirror_are_those_of_the_whole():
     floor = (Ground.floor(3.5 * C, friction=0.2, thickness=C),)
     whole, half = (

@@ -1,7 +1,9 @@
 """The chart of speed against accuracy, at tiny sizes."""
 
 import csv
+from contextlib import nullcontext
 from dataclasses import replace
+from types import SimpleNamespace
 
 import h5py
 import numpy as np
@@ -24,6 +26,7 @@ from speed_accuracy import (
 from mpmopt.assess.discretisation import Discretisation, Measured
 from mpmopt.design.problem import Problem
 from mpmopt.errors import SceneError
+from mpmopt.scene.particles import discretise
 
 BARS = (("bar", "updated"), ("bar", "total"))
 
@@ -90,13 +93,62 @@ def test_the_time_at_equal_accuracy_is_of_points_that_are_not_right_by_chance():
         point(32, 1.0, 0.009), point(64, 4.0, 0.1), point(128, 16.0, 0.01),
         point(32, 0.5, 0.2, TOTAL), point(64, 2.0, 0.01, TOTAL), point(128, 8.0, 0.002, TOTAL),
     ]  # fmt: skip
-    rows = {row["off by at most"]: row for row in at_equal_accuracy(points, {"bar": 0.003})}
+    rows = {row["off by at most"]: row for row in at_equal_accuracy(points, {"bar": (0.003, 1.0)})}
     assert rows["20 %"]["times"] == "2.0"  # 1 s and 0.5 s
     assert rows["5 %"]["times"] == "8.0"  # 16 s and 2 s: 32 cells are right by chance
     assert rows["0.5 %"]["updated"] == "none"
     assert rows["0.5 %"]["total, s"] == "8"
-    assert rows["1 %"]["references apart"] == "0.3%"
-    assert [*rows][-1] == "0.5 %"  # what the references themselves do not agree on is left out
+    assert rows["1 %"]["known to"] == "0.30%"
+    assert [*rows][-1] == "0.5 %"  # what the reference itself does not know is left out
+
+
+def test_peers_take_as_long_as_the_particles_and_steps_that_mls_mpm_needs(monkeypatch):
+    def point(n, seconds, choice, scene="bar"):
+        here = Discretisation((n, n), 100, formulation=choice.formulation)
+        return Point(
+            scene, n, 100, 0.4, choice.name, Measured(here, seconds, travel=1.0), travel_error=0.04
+        )
+
+    asked = []
+
+    def runner(module, cells, steps):
+        asked.append((module, cells, steps))
+        return nullcontext(SimpleNamespace(ready=lambda: 1_000_000))
+
+    def in_turns(runs, rounds):
+        assert rounds == 3
+        seconds = {"taichi_mpm 128 alone": 2.0, "taichi_mpm 128 two": 3.0}
+        seconds |= {"warp_mpm 128 alone": 1.5, "warp_mpm 128 two": 3.6}
+        return {name: np.full(3, seconds.get(name, 0.02)) for name in runs}
+
+    monkeypatch.setattr(speed_accuracy, "Runner", runner)
+    monkeypatch.setattr(speed_accuracy, "in_turns", in_turns)
+    points = [point(32, 1.0, PLAIN), point(16, 0.5, TOTAL)]
+    rows = speed_accuracy.against_peers(points, {"bar": (0.06, 0.1)}, 3)
+    assert [row["off by at most"] for row in rows] == ["20 %", "15 %", "10 %"]
+    # 32 x 2 cells of four particles, 100 steps: at 1.5 s for a million of them, against 0.01 s.
+    assert rows[-1]["peer, alone, s"] == "0.0384, Warp"
+    assert rows[-1]["times, alone"] == "3.8"
+    assert rows[-1]["peer, two, s"] == "0.0384, Taichi"
+    assert set(asked) == {("taichi_mpm", 128, 1000), ("warp_mpm", 128, 1000)}
+    # Of a robot with a plane of symmetry they do both halves.
+    whole = speed_accuracy.particles(point(64, 1.0, PLAIN, "crawler on ground"))
+    scene = speed_accuracy.laid_out(ROBOTS["crawler on ground"][0], 64, 0.2, PLAIN)
+    half = len(discretise(scene.scene(ROBOTS["crawler on ground"][0])).position)
+    assert whole == 2 * half
+
+
+def test_a_limit_is_where_errors_of_order_two_vanish():
+    cells = (64, 128, 192)
+    measured = tuple(
+        Measured(Discretisation((n, n), 1), travel=2.0 + 3.0 / n**2, gradient=np.array([1.0, h**2]))
+        for n, h in zip(cells, (3.0, 1.5, 1.0))
+    )
+    found = speed_accuracy.Limit("walker on ground", "total", 0.2, cells, measured)
+    assert found.extrapolated.travel == pytest.approx(2.0, rel=1e-12)
+    assert found.extrapolated.gradient is measured[-1].gradient
+    # The finest gradient is one off, and as long as the square root of two.
+    assert found.gradient_left == pytest.approx(1.0 / np.sqrt(2.0), rel=1e-12)
 
 
 def test_the_front_is_a_front():
@@ -151,6 +203,7 @@ def test_a_chart_is_left_with_its_tables(tmp_path, monkeypatch, drawn):
     points = [(32, 0.4, PLAIN), (32, 0.8, PLAIN), (64, 0.8, PLAIN), (32, 0.4, TOTAL)]
     monkeypatch.setattr(speed_accuracy, "settings", lambda quick: points)
     monkeypatch.setattr(speed_accuracy, "QUICK_REFERENCE", (96, 0.8, PLAIN))
+    monkeypatch.setattr(speed_accuracy, "QUICK_LIMITS", (32, 64, 96))
     assert speed_accuracy.main(["--quick", "--out", str(tmp_path)]) == 0
     assert ((tmp_path / "speed_accuracy.png").stat().st_size > 10_000) == drawn
     with (tmp_path / "speed_accuracy.csv").open() as file:

@@ -12,9 +12,11 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
+from mpmopt.scene.scene import Formulation
+from stability.inversion import lumped
 from stability.safe import STRENGTH
 from stability.time_step import RESONANCES, SAFE_COURANT, SAFE_TURN
-from stability.weak import HEAVY, SAFE_STIFFNESS
+from stability.weak import HEAVY, SAFE_STIFFNESS, SAFE_TOTAL_COURANT, SAFE_TOTAL_STIFFNESS
 
 Rows = list[dict[str, Any]]
 Tables = Mapping[str, Rows]
@@ -79,21 +81,22 @@ def motion(axes: Axes, tables: Tables) -> None:
     axes.legend(fontsize=7, loc="lower left", bbox_to_anchor=(0.0, 0.1))
 
 
-def weak(heavy: bool) -> Callable[[Axes, Tables], None]:
+def weak(formulation: Formulation, heavy: bool) -> Callable[[Axes, Tables], None]:
     """Heat map of what void does, for equal floors or for a heavy void density."""
+    total = formulation == "total"
 
     def draw(axes: Axes, tables: Tables) -> None:
         rows = [
             row
             for row in tables["weak"]
-            if row["formulation"] == "updated"
+            if row["formulation"] == formulation
             and (
                 row["void_density"] == HEAVY
-                if heavy
-                else row["void_density"] == row["void_stiffness"]
+                if heavy and not total
+                else (row["void_density"] != row["void_stiffness"]) is heavy
             )
         ]
-        epsilons = sorted({row["void_stiffness"] for row in tables["weak"]}, reverse=True)
+        epsilons = sorted({row["void_stiffness"] for row in rows}, reverse=True)
         courants = sorted({row["courant"] for row in rows})
         colour = np.full((len(epsilons), len(courants)), np.nan)
         for (epsilon, courant), both in groups(rows, "void_stiffness", "courant").items():
@@ -108,16 +111,20 @@ def weak(heavy: bool) -> Callable[[Axes, Tables], None]:
             colour[i, j] = max(np.nanmax([row["largest_deviation"] for row in both] + [1e-6]), 1e-6)
         image = axes.imshow(colour, cmap="YlOrBr", norm=LogNorm(1e-5, 1e-1), aspect="auto")
         if heavy:
-            wide = sum(courant <= SAFE_COURANT for courant in courants)
-            top = sum(epsilon > SAFE_STIFFNESS for epsilon in epsilons)
-            corner, size = (-0.5, top - 0.5), (wide, len(epsilons) - top)
+            most = SAFE_TOTAL_COURANT if total else SAFE_COURANT
+            least, stiffest = SAFE_TOTAL_STIFFNESS if total else (0.0, SAFE_STIFFNESS)
+            wide = sum(courant <= most for courant in courants)
+            top = sum(epsilon > 1.01 * stiffest for epsilon in epsilons)
+            high = sum(epsilon > 0.99 * least for epsilon in epsilons) - top
+            corner, size = (-0.5, top - 0.5), (wide, high)
             axes.add_patch(Rectangle(corner, *size, fill=False, ec="tab:green", lw=3, zorder=3))
         axes.set_xticks(range(len(courants)), [f"{c:g}" for c in courants], fontsize=7)
         axes.set_yticks(range(len(epsilons)), [f"{e:.0e}" for e in epsilons], fontsize=7)
         axes.set_xlabel("Courant number")
         axes.set_ylabel("void stiffness")
-        what = f"void density {HEAVY:g}" if heavy else "same void density"
-        axes.set_title(f"Void beside solid, {what} (n/m failed)")
+        much = "ten times that void density" if total else f"void density {HEAVY:g}"
+        what = ", total" * total + f", {much if heavy else 'same void density'}"
+        axes.set_title(f"Void{what} (n/m failed)")
         bar = axes.figure.colorbar(image, ax=axes, pad=0.02)
         bar.set_label("void moves L by", fontsize=7)
         bar.ax.tick_params(labelsize=7)
@@ -167,6 +174,30 @@ def fracture(axes: Axes, tables: Tables) -> None:
     axes.legend(fontsize=7, loc="center right")
 
 
+def pulled(axes: Axes, tables: Tables) -> None:
+    """Which pulled bars come back, and how far they were stretched."""
+    names = []
+    for y, ((formulation, per_cell, courant), rows) in enumerate(
+        groups(tables["fracture_bar"], "formulation", "per_cell", "courant").items()
+    ):
+        kind = "total" if formulation == "total" else "MLS-MPM"
+        names.append(f"{kind}, {per_cell} a cell,\nCourant {courant:g}")
+        whole = [row for row in rows if row["comes_back"]]
+        torn = [row["speed"] for row in rows if not row["comes_back"]]
+        axes.plot(column(whole, "speed"), [y] * len(whole), "o", ms=5, color="tab:green")
+        axes.plot(torn, [y] * len(torn), "x", ms=6, color=FAILED)
+        for row in whole:
+            note(axes, row["speed"], y + 0.15, f"{row['stretch']:.1f}", ha="center", fontsize=6)
+    axes.set_xscale("log")
+    ticks = sorted({row["speed"] for row in tables["fracture_bar"]})
+    axes.set_xticks(ticks, [f"{t:g}" for t in ticks])
+    axes.set_xticks([], minor=True)
+    axes.set_yticks(range(len(names)), names, fontsize=6)
+    axes.set_ylim(-0.5, len(names) - 0.3)
+    axes.set_xlabel("speed of the ends / $c_p$")
+    axes.set_title("Pulled bar: comes back, stretched so far (x: torn, failed)")
+
+
 def vortex(axes: Axes, tables: Tables) -> None:
     """Errors of the vortex over its greatest stretch."""
     for (formulation, cells, courant), rows in groups(
@@ -190,10 +221,14 @@ def vortex(axes: Axes, tables: Tables) -> None:
         )
     axes.axvline(2.0, **LIMIT)
     axes.axvspan(1.0, 2.0, **SAFE)
+    for cells in sorted({row["cells"] for row in tables["vortex"]}):
+        axes.axhline(lumped(cells), **LIMIT | {"lw": 0.6})
+        note(axes, 7.9, lumped(cells), f"lumped mass, {cells}", ha="right", va="bottom", fontsize=5)
     ticks = (1.2, 1.5, 2.0, 3.0, 5.0, 7.0)
     axes.set_xticks(ticks, [f"{t:g}" for t in ticks])
     axes.set_xticks([], minor=True)
     axes.set_xlim(1.15, 8.0)
+    axes.set_ylim(bottom=5e-4)  # room for the legend
     axes.set_xlabel("greatest stretch (A = 0.05 ... 1)")
     axes.set_ylabel("error / A")
     axes.set_title("Vortex, by Courant number (x: failed)")
@@ -286,16 +321,17 @@ def optimiser(axes: Axes, tables: Tables) -> None:
 
 
 PANELS = (
-    rest, motion, weak(False), weak(True), ellipticity, fracture, vortex, adversary, incline, sizes,
-    radii, optimiser,
+    rest, motion, weak("updated", False), weak("updated", True), weak("total", False),
+    weak("total", True), fracture, pulled, vortex, ellipticity, adversary, incline, sizes, radii,
+    optimiser,
 )  # fmt: skip
 
 
 def plot(path: Path, tables: Tables) -> None:
     """Write the figure."""
-    figure = Figure(figsize=(15.5, 11.5), layout="constrained")
+    figure = Figure(figsize=(19.0, 11.5), layout="constrained")
     FigureCanvasAgg(figure)
-    for axes, panel in zip(figure.subplots(3, 4).flat, PANELS, strict=True):
+    for axes, panel in zip(figure.subplots(3, 5).flat, PANELS, strict=True):
         panel(axes, tables)
         axes.title.set_fontsize(10)
         axes.xaxis.label.set_fontsize(8)

@@ -12,17 +12,20 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
+from scipy.spatial import KDTree
 
 from mpmopt import kernels
 from mpmopt.assess.trajectory import with_image
 from mpmopt.kernels.lagrangian import LEAST_J
+from mpmopt.kernels.overlap import FAR
+from mpmopt.kernels.pairs import REACH
 from mpmopt.scene import Scene
 from mpmopt.simulation.lagrangian import LagrangianSimulation
 from mpmopt.simulation.simulation import Simulation
 from mpmopt.simulation.surroundings import holders
 
 # What a state has, and what it is given (less than zero: what is taken from it).
-ENERGIES = ("kinetic", "elastic", "gravity", "layer")
+ENERGIES = ("kinetic", "elastic", "gravity", "layer", "self-contact")
 WORKS = ("actuation", "viscosity", "friction", "damping", "walls", "clamps", "transfer")
 Array = NDArray[np.float64]
 
@@ -36,8 +39,8 @@ class Books:
     scene : Scene
     time : (S + 1,) array
     energy : dict of str to (S + 1,) array
-        By kind: kinetic, with what the affine velocity has; elastic; gravity; and what the grounds'
-        layers store.
+        By kind: kinetic, with what the affine velocity has; elastic; gravity; what the grounds'
+        layers store; and what pairs of the formulation "total" do that push each other.
     work : dict of str to (S + 1,) array
         What was done so far, by whom: actuation, viscosity, friction and damping of grounds, walls
         in all, clamps in all, and transfer between particles and nodes, of which no body knows; the
@@ -293,7 +296,12 @@ class _Account:
             for b, layer in zip(borne, self.layers)
         )
         fallen = -float((self.mass * x).sum(axis=1) @ self.scene.gravity)
-        return self.kinetic(state), float((self.volume * density).sum()), fallen, layer
+        elastic = float((self.volume * density).sum())
+        return self.kinetic(state), elastic, fallen, layer, self.pressed(x)
+
+    def pressed(self, x: Array) -> float:
+        """Energy of parts at (2, N) that press each other, of which a grid has none."""
+        return 0.0
 
     def held(self, state: Array) -> Array:
         """What each actuator squeezes (K,): V/2 S : F^T F."""
@@ -429,6 +437,11 @@ class _LatticeAccount(_Account):
             self._m = np.tile(self._m, 2)
         self._holder = np.full(len(m), -1)
         self._holder[lattice.held] = lattice.holder
+        grip = lattice.touch.grip[self.simulation._seat].real.astype(float)
+        self._grip = np.resize(grip, len(self.mass))  # images have that of their originals
+        rest = np.zeros((kernels.STATE_SIZE, len(grip)))
+        rest[:2] = self.simulation.particles.position.T
+        self._rest = self._both(rest)[:2]
 
     @property
     def _lines(self) -> tuple[int, int]:
@@ -469,6 +482,29 @@ class _LatticeAccount(_Account):
     def kinetic(self, state: Array) -> float:
         return 0.5 * float((self._m * self._nodes(state)[2:] ** 2).sum())
 
+    def _pairs(self, x: Array) -> tuple[NDArray[np.int64], NDArray[np.int64], Array, Array]:
+        """Pairs (P,) and (P,) of particles at (2, N) that push each other, d (2, P) and |d|."""
+        dx = self.scene.grid.dx
+        solid = np.flatnonzero(self._grip > 0.0)
+        a, b = solid[KDTree(x[:, solid].T).query_pairs(REACH * dx, output_type="ndarray")].T
+        # The distance of particles at rest, whose sites are integers, is not left to rounding.
+        far = np.hypot(*(self._rest[:, a] - self._rest[:, b])) > FAR * dx * (1.0 + 1e-9)
+        a, b = a[far], b[far]
+        d = x[:, a] - x[:, b]
+        return a, b, d, np.hypot(*d)
+
+    def pressed(self, x: Array) -> float:
+        a, b, _, r = self._pairs(x)
+        deep = REACH * self.scene.grid.dx - r
+        return 0.5 * float((self._grip[a] * self._grip[b] * deep**2).sum())
+
+    def _pushed_apart(self, x: Array) -> Array:
+        """Forces (2, N) of particles at (2, N) on each other."""
+        a, b, d, r = self._pairs(x)
+        f = self._grip[a] * self._grip[b] * (REACH * self.scene.grid.dx / r - 1.0) * d
+        count = x.shape[1]
+        return np.array([np.bincount(a, k, count) - np.bincount(b, k, count) for k in f])
+
     def _logarithm(self, F: Array) -> Array:
         J = _determinant(F)
         safe = np.maximum(J, LEAST_J)
@@ -493,7 +529,7 @@ class _LatticeAccount(_Account):
 
         # Velocities of nodes without friction, damping and clamps.
         borne, normal = self._bearing(x)
-        push = (borne[:, None] * normal).sum(axis=0)
+        push = (borne[:, None] * normal).sum(axis=0) + self._pushed_apart(x)
         count = half.shape[1]
         stress = self._first_piola(F, viscous, signal)[:, :, :count]
         N, Gx, Gy = simulation._weights
