@@ -127,8 +127,8 @@ def test_what_moves_alike_keeps_its_lists_but_not_those_of_images(rng):
     near, _ = pairs.renewed(pairs.nowhere(touch), nodes, touch)
     nodes[:2] += 9.0 * C * rng.uniform(-1.0, 1.0, (2, 1))
     kept, room = pairs.renewed(near, nodes, touch)
-    assert np.array_equal(kept.cells_at, whole.start[:2])
-    assert room == pytest.approx(pairs.HALF * pairs.WIDE_SKIN * C, rel=1e-9)
+    assert np.array_equal(kept.at, whole.start[:2])
+    assert room == pytest.approx(pairs.HALF * pairs.SKIN * C, rel=1e-9)
     for mirror, corners in ((Mirror("x", 8 * C), IMAGES), (Mirror("y", 8 * C), RAILS)):
         half = simulation_of(body(*corners, mirror=mirror))
         touch, nodes = half.lattice.touch, half.start.copy()
