@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mpmopt.kernels.compiler import bare_jit, inner_jit, inner_loop_jit, loop_jit
+from mpmopt.kernels.compiler import bare_jit, inner_jit, inner_loop_jit
 from mpmopt.kernels.overlap import FAR
 
 # Distance d_c below which two particles push each other, in cells.
@@ -114,7 +114,7 @@ def strayed(nodes, at, touch):
     return 0.5 * math.hypot(high_x - low_x, high_y - low_y)
 
 
-@loop_jit
+@inner_loop_jit
 def nowhere(touch: Any) -> Near:
     """A list that holds for no state but where no cells were near before."""
     return Near(touch.alone, np.empty((0, 2), np.int64), np.empty(0, np.int64))
@@ -242,7 +242,7 @@ def members_of(cells, count):
     return members[:total]
 
 
-@loop_jit
+@inner_loop_jit
 def renewed(near: Any, nodes: NDArray, touch: Any) -> tuple[Near, float]:
     """The list for nodes (., M), of which the first two rows are x and y: anew if they moved.
 
@@ -256,7 +256,9 @@ def renewed(near: Any, nodes: NDArray, touch: Any) -> tuple[Near, float]:
                 at[axis, i] = nodes[axis, i].real
         cells = look(at, touch)
         if len(cells) == 0:
-            touch.alone[:] = at
+            for axis in range(2):
+                for i in range(at.shape[1]):
+                    touch.alone[axis, i] = at[axis, i]
         near = Near(at, cells, members_of(cells, len(touch.grip)))
     return near, may - moved
 
@@ -309,7 +311,7 @@ def way_between(pairs, n, place, touch):
     return a, b, image, place[a, 0] - x, place[a, 1] - y
 
 
-@loop_jit
+@inner_loop_jit
 def push_apart(near: Any, nodes: NDArray, touch: Any, force: NDArray) -> None:
     """Adds the pairs' forces to the first two rows of the nodes' `force` (., M)."""
     reach, grip = REACH * touch.dx, touch.grip.ravel()
@@ -344,7 +346,7 @@ def spread(near, touch, numbers, nodes):
                     nodes[1, i] += w * y
 
 
-@loop_jit
+@inner_loop_jit
 def push_apart_adjoint(
     near: Any,
     nodes: NDArray,

@@ -15,7 +15,7 @@ from numba.core import cgutils
 from numba.core.typing.templates import AbstractTemplate, infer_global
 from numba.extending import intrinsic, lower_builtin, models, overload, register_model
 
-from mpmopt.kernels.compiler import jit
+from mpmopt.kernels.compiler import inner_jit
 
 
 def load(array, k):
@@ -141,13 +141,13 @@ def greatest(x, y):
     return np.maximum(x, y)
 
 
-@jit
+@inner_jit
 def tensor(array, k):
     """Records k to k + 3: the components of a tensor."""
     return load(array, k), load(array, k + 1), load(array, k + 2), load(array, k + 3)
 
 
-@jit
+@inner_jit
 def store_tensor(array, k, x00, x01, x10, x11):
     """Write what `tensor` reads."""
     store(array, k, x00)
@@ -156,25 +156,25 @@ def store_tensor(array, k, x00, x01, x10, x11):
     store(array, k + 3, x11)
 
 
-@jit
+@inner_jit
 def add(array, k, record):
     """Add to what `load` reads."""
     store(array, k, load(array, k) + record)
 
 
-@jit
+@inner_jit
 def add_four(array, place, record):
     """Add to what `four` reads."""
     put_four(array, place, four(array, place) + record)
 
 
-@jit
+@inner_jit
 def pair_of(array, a, b, lane):
     """The pair of one number each of records a and b of an array (M, 4)."""
     return pair(number(array, a, lane), number(array, b, lane))
 
 
-@jit
+@inner_jit
 def add_number(array, k, lane, value):
     """Add to what `number` reads."""
     set_number(array, k, lane, number(array, k, lane) + value)
@@ -633,7 +633,7 @@ def _exponent_and_fraction(typingctx, record):
     return result(record), generate
 
 
-@jit
+@inner_jit
 def _log(x):
     """ln x = k ln 2 + 2 artanh(s), s = (m - 1) / (m + 1), where x = 2^k m; |s| < 0.1716."""
     k, m = _exponent_and_fraction(x)
