@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from numba import njit
+from numba.core.registry import cpu_target
 
 
 def _can_cache() -> bool:
@@ -36,16 +37,21 @@ def _digest() -> str:
 
 STAMP = _digest()
 
+# What an index or a sum of numbers means is asked in the order in which meanings were made known.
+# A look into the disk cache would make those of strings, lists and dictionaries known first.
+cpu_target.typing_context.refresh()
+
 # No "nnan" or "ninf": comparisons must see what is not a number.
 OPTIONS: dict[str, Any] = {
     "cache": _can_cache(),
+    "no_cfunc_wrapper": True,
     "nogil": True,
     "error_model": "numpy",
     "fastmath": {"contract", "reassoc", "nsz", "arcp"},
 }
 
 # For compiled callers alone: no function that unpacks Python's objects is compiled beside it.
-INNER: dict[str, Any] = {**OPTIONS, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+INNER: dict[str, Any] = {**OPTIONS, "no_cpython_wrapper": True}
 
 # And without the counting of references to arrays.
 BARE: dict[str, Any] = {**INNER, "_nrt": False}

@@ -6,14 +6,16 @@ The functions on NumPy arrays are their definition; compiled, they are vector re
 import functools
 import math
 import operator
+from typing import ClassVar
 
 import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
-from numba.extending import intrinsic, models, overload, register_model
+from numba.core.typing.templates import AbstractTemplate, infer_global
+from numba.extending import intrinsic, lower_builtin, models, overload, register_model
 
-from mpmopt.kernels.compiler import jit
+from mpmopt.kernels.compiler import inner_jit
 
 
 def load(array, k):
@@ -139,13 +141,13 @@ def greatest(x, y):
     return np.maximum(x, y)
 
 
-@jit
+@inner_jit
 def tensor(array, k):
     """Records k to k + 3: the components of a tensor."""
     return load(array, k), load(array, k + 1), load(array, k + 2), load(array, k + 3)
 
 
-@jit
+@inner_jit
 def store_tensor(array, k, x00, x01, x10, x11):
     """Write what `tensor` reads."""
     store(array, k, x00)
@@ -154,25 +156,25 @@ def store_tensor(array, k, x00, x01, x10, x11):
     store(array, k + 3, x11)
 
 
-@jit
+@inner_jit
 def add(array, k, record):
     """Add to what `load` reads."""
     store(array, k, load(array, k) + record)
 
 
-@jit
+@inner_jit
 def add_four(array, place, record):
     """Add to what `four` reads."""
     put_four(array, place, four(array, place) + record)
 
 
-@jit
+@inner_jit
 def pair_of(array, a, b, lane):
     """The pair of one number each of records a and b of an array (M, 4)."""
     return pair(number(array, a, lane), number(array, b, lane))
 
 
-@jit
+@inner_jit
 def add_number(array, k, lane, value):
     """Add to what `number` reads."""
     set_number(array, k, lane, number(array, k, lane) + value)
@@ -194,8 +196,36 @@ class RegisterModel(models.PrimitiveModel):
         super().__init__(manager, kind, _vector(kind))
 
 
-FLAGS = ("contract", "reassoc", "nsz", "arcp")
+# An instruction that has flags gets none of the kernels' options.
+FLAGS, ROUNDED = ("contract", "reassoc", "nsz", "arcp"), ("nsz",)
 INT32 = ir.IntType(32)
+
+
+def _compiled(definition, *ways):
+    """Decorate what makes the compiled form of a function, or of an operator, on types in `ways`.
+
+    It takes the types of the arguments and returns a signature and what writes the instructions,
+    or none. These stand where the call does: nothing else is compiled, and no other meaning of an
+    operator is asked for before.
+    """
+
+    def decorate(operation):
+        @infer_global(definition)
+        class Template(AbstractTemplate):
+            metadata: ClassVar = {"target": "cpu"}  # asked before what is for all targets
+
+            def generic(self, arguments, _):
+                found = operation(*arguments)
+                return found and found[0]
+
+        def write(context, builder, signature, arguments):
+            return operation(*signature.args)[1](context, builder, signature, arguments)
+
+        for way in ways or [(types.VarArg(types.Any),)]:
+            lower_builtin(definition, *way)(write)
+        return operation
+
+    return decorate
 
 
 def _vector(kind):
@@ -240,131 +270,20 @@ def _spread_out(context, builder, kind, value):
     return _shuffle(builder, vector, vector, list(range(len(parts))) * kind.lanes)
 
 
-def _pointer(context, builder, array_type, array, k, vector, lane=None):
-    """To what `load` reads, or to one of its numbers; the compiler need not look up strides."""
-    array = context.make_array(array_type)(context, builder, array)
-    place = builder.mul(k, k.type(_register(array_type).lanes))
-    if lane is not None:
-        place = builder.add(place, lane)
-    return builder.bitcast(builder.gep(array.data, [place]), vector.as_pointer())
+def _as(context, builder, value, of, kind):
+    """A number or register as a register of some kind."""
+    if not isinstance(of, Register):
+        return _spread_out(context, builder, kind, context.cast(builder, value, of, kind.dtype))
+    if of == kind:
+        return value
+    zeros = ir.Constant(_vector(of), None)
+    lanes = [lane for k in range(of.lanes) for lane in (k, of.lanes + k)]
+    return _shuffle(builder, value, zeros, lanes)
 
 
-@intrinsic
-def _number(typingctx, array, k, lane):
-    def generate(context, builder, signature, arguments):
-        kind = context.get_data_type(array.dtype)
-        return builder.load(_pointer(context, builder, array, *arguments[:2], kind, arguments[2]))
-
-    return array.dtype(array, types.intp, types.intp), generate
-
-
-@intrinsic
-def _set_number(typingctx, array, k, lane, value):
-    def generate(context, builder, signature, arguments):
-        kind = context.get_data_type(array.dtype)
-        pointer = _pointer(context, builder, array, *arguments[:2], kind, arguments[2])
-        builder.store(arguments[3], pointer)
-        return context.get_dummy_value()
-
-    return types.none(array, types.intp, types.intp, array.dtype), generate
-
-
-@intrinsic
-def _load(typingctx, array, k):
-    kind = _register(array)
-
-    def generate(context, builder, signature, arguments):
-        pointer = _pointer(context, builder, array, *arguments, _vector(kind))
-        return builder.load(pointer, align=4)
-
-    return kind(array, types.intp), generate
-
-
-def _place(context, builder, array_type, array, place, vector):
-    """To what `four` reads."""
-    array = context.make_array(array_type)(context, builder, array)
-    return builder.bitcast(builder.gep(array.data, [place]), vector.as_pointer())
-
-
-@intrinsic
-def _four(typingctx, array, place):
-    kind = Register(array.dtype, 4)
-
-    def generate(context, builder, signature, arguments):
-        pointer = _place(context, builder, array, *arguments, _vector(kind))
-        return builder.load(pointer, align=4)
-
-    return kind(array, types.intp), generate
-
-
-@intrinsic
-def _put_four(typingctx, array, place, record):
-    kind = Register(array.dtype, 4)
-
-    def generate(context, builder, signature, arguments):
-        pointer = _place(context, builder, array, *arguments[:2], _vector(kind))
-        builder.store(arguments[2], pointer, align=4)
-        return context.get_dummy_value()
-
-    return types.none(array, types.intp, kind), generate
-
-
-@intrinsic
-def _nothing(typingctx, array):
-    kind = _register(array)
-
-    def generate(context, builder, signature, arguments):
-        return ir.Constant(_vector(kind), None)
-
-    return kind(array), generate
-
-
-@intrinsic
-def _store(typingctx, array, k, record):
-    kind = _register(array)
-
-    def generate(context, builder, signature, arguments):
-        pointer = _pointer(context, builder, array, *arguments[:2], _vector(kind))
-        builder.store(arguments[2], pointer, align=4)
-        return context.get_dummy_value()
-
-    return types.none(array, types.intp, kind), generate
-
-
-@intrinsic
-def _pack(typingctx, numbers):
-    dtype = types.complex128 if types.complex128 in numbers.types else numbers.types[0]
-    kind = Register(dtype, len(numbers))
-
-    def generate(context, builder, signature, arguments):
-        values = cgutils.unpack_tuple(builder, arguments[0])
-        values = [
-            context.cast(builder, v, of, dtype) for v, of in zip(values, numbers.types, strict=True)
-        ]
-        return _filled(context, builder, kind, values)
-
-    return kind(numbers), generate
-
-
-@intrinsic
-def _as(typingctx, x, like):
-    """A number or register as a register that can be combined with another one, or a number."""
-    kind = x if isinstance(x, Register) else like
-    if types.complex128 in (getattr(x, "dtype", x), getattr(like, "dtype", like)):
-        kind = Register(types.complex128, kind.lanes)
-
-    def generate(context, builder, signature, arguments):
-        value = arguments[0]
-        if not isinstance(x, Register):
-            value = context.cast(builder, value, x, kind.dtype)
-            return _spread_out(context, builder, kind, value)
-        if x == kind:
-            return value
-        zeros = ir.Constant(_vector(x), None)
-        lanes = [lane for k in range(x.lanes) for lane in (k, x.lanes + k)]
-        return _shuffle(builder, value, zeros, lanes)
-
-    return kind(x, like), generate
+def _real_kind(kind):
+    """Of the real parts of a register."""
+    return Register(types.float64 if kind.dtype == types.complex128 else kind.dtype, kind.lanes)
 
 
 def _real_parts(builder, record, vector):
@@ -379,39 +298,132 @@ def _all(builder, lanes):
     )
 
 
-@intrinsic
-def _real(typingctx, x):
-    dtype = types.float64 if x.dtype == types.complex128 else x.dtype
-
-    def generate(context, builder, signature, arguments):
-        return _real_parts(builder, x, arguments[0])
-
-    return Register(dtype, x.lanes)(x), generate
+def _pointer(context, builder, array_type, array, place, kind):
+    """To a number or register at a place of an array; the compiler need not look up strides."""
+    array = context.make_array(array_type)(context, builder, array)
+    return builder.bitcast(builder.gep(array.data, [place]), kind.as_pointer())
 
 
-@intrinsic
-def _whole(typingctx, x):
-    def generate(context, builder, signature, arguments):
+def _record(builder, array, k):
+    """The place of record or pair k in an array."""
+    return builder.mul(k, k.type(_register(array).lanes))
+
+
+@_compiled(number)
+def _number(array, k, lane):
+    def write(context, builder, signature, arguments):
+        place = builder.add(_record(builder, array, arguments[1]), arguments[2])
+        kind = context.get_data_type(array.dtype)
+        return builder.load(_pointer(context, builder, array, arguments[0], place, kind))
+
+    return array.dtype(array, types.intp, types.intp), write
+
+
+@_compiled(set_number)
+def _set_number(array, k, lane, value):
+    def write(context, builder, signature, arguments):
+        place = builder.add(_record(builder, array, arguments[1]), arguments[2])
+        kind = context.get_data_type(array.dtype)
+        builder.store(arguments[3], _pointer(context, builder, array, arguments[0], place, kind))
+        return context.get_dummy_value()
+
+    return types.none(array, types.intp, types.intp, array.dtype), write
+
+
+def _reads(kind, place_of):
+    """What reads a register of a kind from the place of an array that a number k tells."""
+
+    def operation(array, k):
+        def write(context, builder, signature, arguments):
+            place, vector = place_of(builder, array, arguments[1]), _vector(kind(array))
+            pointer = _pointer(context, builder, array, arguments[0], place, vector)
+            return builder.load(pointer, align=4)
+
+        return kind(array)(array, types.intp), write
+
+    return operation
+
+
+def _writes(kind, place_of):
+    """The same, of what writes it."""
+
+    def operation(array, k, record):
+        def write(context, builder, signature, arguments):
+            place, vector = place_of(builder, array, arguments[1]), _vector(kind(array))
+            pointer = _pointer(context, builder, array, arguments[0], place, vector)
+            builder.store(arguments[2], pointer, align=4)
+            return context.get_dummy_value()
+
+        return types.none(array, types.intp, kind(array)), write
+
+    return operation
+
+
+def _of_four(array):
+    """What `four` reads from an array."""
+    return Register(array.dtype, 4)
+
+
+def _itself(builder, array, place):
+    return place
+
+
+_compiled(load)(_reads(_register, _record))
+_compiled(store)(_writes(_register, _record))
+_compiled(four)(_reads(_of_four, _itself))
+_compiled(put_four)(_writes(_of_four, _itself))
+
+
+@_compiled(nothing)
+def _nothing(array):
+    kind = _register(array)
+    return kind(array), lambda *_: ir.Constant(_vector(kind), None)
+
+
+@_compiled(pack)
+@_compiled(pair)
+def _pack(*numbers):
+    dtype = types.complex128 if types.complex128 in numbers else numbers[0]
+    kind = Register(dtype, len(numbers))
+
+    def write(context, builder, signature, arguments):
+        pairs = zip(arguments, numbers, strict=True)
+        values = [context.cast(builder, value, of, dtype) for value, of in pairs]
+        return _filled(context, builder, kind, values)
+
+    return kind(*numbers), write
+
+
+@_compiled(real)
+def _real(x):
+    return _real_kind(x)(x), lambda _, builder, __, arguments: _real_parts(builder, x, *arguments)
+
+
+@_compiled(whole)
+def _whole(x):
+    def write(context, builder, signature, arguments):
         vector = _vector(x)
         name = f"llvm.trunc.v4f{32 if x.dtype == types.float32 else 64}"
         kind = ir.FunctionType(vector, [vector])
         function = cgutils.get_or_insert_function(builder.module, kind, name)
         return builder.call(function, arguments)
 
-    return x(x), generate
+    return x(x), write
 
 
-@intrinsic
-def _cell_coordinate(typingctx, x, per_dx):
-    def generate(context, builder, signature, arguments):
-        kind = arguments[0].type
-        half = ir.Constant(kind, x.lanes * [0.5] if isinstance(x, Register) else 0.5)
-        per_dx_ = arguments[1] if per_dx == x else context.cast(builder, arguments[1], per_dx, x)
-        # Having a flag, these get none of the options', which would let them be contracted.
-        cells = builder.fmul(arguments[0], per_dx_, flags=("nsz",))
-        return builder.fsub(cells, half, flags=("nsz",))
+@_compiled(cell_coordinate)
+def _cell_coordinate(x, per_dx):
+    def write(context, builder, signature, arguments):
+        value, scale = arguments
+        half = ir.Constant(value.type, x.lanes * [0.5] if isinstance(x, Register) else 0.5)
+        if isinstance(x, Register):
+            scale = _as(context, builder, scale, per_dx, x)
+        else:
+            scale = context.cast(builder, scale, per_dx, x)
+        cells = builder.fmul(value, scale, flags=ROUNDED)
+        return builder.fsub(cells, half, flags=ROUNDED)
 
-    return x(x, per_dx), generate
+    return x(x, per_dx), write
 
 
 @intrinsic
@@ -425,95 +437,105 @@ def _fused(typingctx, a, b, c):
     return kind(a, b, c), generate
 
 
-@intrinsic
-def _within(typingctx, x, low, high):
-    def generate(context, builder, signature, arguments):
-        above = builder.fcmp_ordered("<=", arguments[1], arguments[0])
-        below = builder.fcmp_ordered("<", arguments[0], arguments[2])
-        return _all(builder, builder.and_(above, below))
+@overload(fused)  # a function of its own: options would let the compiler take it apart
+def _overload_fused(a, b, c):
+    if types.complex128 in (a, b, c):
+        return lambda a, b, c: complex(_fused(a.real, b.real, c.real), (a * b + c).imag)
+    return lambda a, b, c: _fused(a, b, c)
 
-    return types.boolean(x, low, high), generate
+
+@_compiled(within)
+def _within(x, low, high):
+    def write(context, builder, signature, arguments):
+        bounds = zip(arguments[1:], (low, high), strict=True)
+        least, most = (_as(context, builder, value, of, x) for value, of in bounds)
+        inside = builder.fcmp_ordered("<=", least, arguments[0])
+        return _all(builder, builder.and_(inside, builder.fcmp_ordered("<", arguments[0], most)))
+
+    return types.boolean(x, low, high), write
 
 
 def _extreme(symbol):
-    @intrinsic
-    def extreme(typingctx, x, y):
-        def generate(context, builder, signature, arguments):
+    def operation(x, y):
+        def write(context, builder, signature, arguments):
             return builder.select(builder.fcmp_ordered(symbol, *arguments), *arguments)
 
-        return x(x, y), generate
+        return x(x, y), write
 
-    return extreme
-
-
-_least, _greatest = _extreme("<"), _extreme(">")
+    return operation
 
 
-def _arithmetic(name):
-    @intrinsic
-    def operate(typingctx, x, y):
-        def generate(context, builder, signature, arguments):
-            a, b = arguments
-            if x.dtype != types.complex128 or name in ("fadd", "fsub"):
-                return getattr(builder, name)(a, b, flags=FLAGS)
+_compiled(least)(_extreme("<"))
+_compiled(greatest)(_extreme(">"))
+
+
+def _joined(x, y):
+    """The register that a sum, difference or product is, of two registers or one and a number."""
+    kind = x if isinstance(x, Register) else y
+    complex_too = types.complex128 in (getattr(x, "dtype", x), getattr(y, "dtype", y))
+    return Register(types.complex128, kind.lanes) if complex_too else kind
+
+
+def _arithmetic(name, flags=FLAGS):
+    """An operation with the name that LLVM has for it."""
+
+    def operation(x, y):
+        if not isinstance(x, Register) and not isinstance(y, Register):
+            return None
+        kind = _joined(x, y)
+
+        def write(context, builder, signature, arguments):
+            a = _as(context, builder, arguments[0], x, kind)
+            b = _as(context, builder, arguments[1], y, kind)
+            if kind.dtype != types.complex128 or name in ("fadd", "fsub"):
+                return getattr(builder, name)(a, b, flags=flags)
             # (a.re + i a.im) b = a.re b + a.im (i b)
-            re, im, turn = ([2 * k + place for k in range(x.lanes) for place in pair] for pair in (
-                (0, 0), (1, 1), (1, 0)
-            ))  # fmt: skip
+            re, im, turn = ([2 * k + place for k in range(kind.lanes) for place in pair]
+                            for pair in ((0, 0), (1, 1), (1, 0)))  # fmt: skip
             turned = _shuffle(builder, b, b, turn)
-            signs = ir.Constant(_vector(x), x.lanes * [-1.0, 1.0])
-            turned = builder.fmul(turned, signs, flags=FLAGS)
-            real = builder.fmul(_shuffle(builder, a, a, re), b, flags=FLAGS)
-            imaginary = builder.fmul(_shuffle(builder, a, a, im), turned, flags=FLAGS)
-            return builder.fadd(real, imaginary, flags=FLAGS)
+            signs = ir.Constant(_vector(kind), kind.lanes * [-1.0, 1.0])
+            turned = builder.fmul(turned, signs, flags=flags)
+            real = builder.fmul(_shuffle(builder, a, a, re), b, flags=flags)
+            imaginary = builder.fmul(_shuffle(builder, a, a, im), turned, flags=flags)
+            return builder.fadd(real, imaginary, flags=flags)
 
-        return x(x, x), generate
+        return kind(x, y), write
 
-    return operate
-
-
-def _overload_arithmetic(symbol, name):
-    operate = _arithmetic(name)
-
-    @overload(symbol)
-    def arithmetic(x, y):
-        if isinstance(x, Register) or isinstance(y, Register):
-            return lambda x, y: operate(_as(x, y), _as(y, x))
+    return operation
 
 
-for _symbol, _name in (
-    (operator.add, "fadd"),
-    (operator.sub, "fsub"),
-    (operator.mul, "fmul"),
-):
-    _overload_arithmetic(_symbol, _name)
+WAYS = (Register, Register), (Register, types.Number), (types.Number, Register)
+_compiled(operator.add, *WAYS)(_arithmetic("fadd"))
+_compiled(operator.sub, *WAYS)(_arithmetic("fsub"))
+_compiled(operator.mul, *WAYS)(_arithmetic("fmul"))
+_compiled(product)(_arithmetic("fmul", ROUNDED))
 
 
-@intrinsic
-def _divide(typingctx, x, y):
-    def generate(context, builder, signature, arguments):
-        return builder.fdiv(*arguments, flags=FLAGS)
-
-    return x(x, x), generate
-
-
-@overload(operator.truediv)
-def _overload_divide(x, y):
-    if isinstance(x, Register) and types.complex128 not in (x.dtype, getattr(y, "dtype", y)):
-        return lambda x, y: _divide(x, _as(y, x))
+@_compiled(operator.truediv, (Register, Register), (Register, types.Number))
+def _divide(x, y):
+    if isinstance(x, Register) and _joined(x, y).dtype != types.complex128:
+        return _arithmetic("fdiv")(x, y)
+    return None
 
 
-@intrinsic
-def _product(typingctx, x, y):
-    def generate(context, builder, signature, arguments):
-        return builder.fmul(*arguments, flags=("nsz",))
+@_compiled(reciprocal)
+def _reciprocal(x):
+    if x.dtype == types.complex128:
+        return None
 
-    return x(x, y), generate
+    def write(context, builder, signature, arguments):
+        ones = ir.Constant(_vector(x), x.lanes * [1.0])
+        return builder.fdiv(ones, arguments[0], flags=FLAGS)
+
+    return x(x), write
 
 
-@intrinsic
-def _lane(typingctx, record, k):
-    def generate(context, builder, signature, arguments):
+@_compiled(operator.getitem, (Register, types.Integer))
+def _lane(record, k):
+    if not isinstance(record, Register):
+        return None
+
+    def write(context, builder, signature, arguments):
         lane = builder.trunc(arguments[1], INT32)
         if record.dtype != types.complex128:
             return builder.extract_element(arguments[0], lane)
@@ -523,47 +545,62 @@ def _lane(typingctx, record, k):
         value.imag = builder.extract_element(arguments[0], builder.add(lane, INT32(1)))
         return value._getvalue()
 
-    return record.dtype(record, types.intp), generate
+    return record.dtype(record, types.intp), write
 
 
-@overload(operator.getitem)
-def _getitem(record, k):
-    if isinstance(record, Register):
-        return lambda record, k: _lane(record, k)
+@_compiled(total)
+def _total(x):
+    def write(context, builder, signature, arguments):
+        parts = 2 if x.dtype == types.complex128 else 1
+        sums = []
+        for part in range(parts):
+            places = [INT32(parts * k + part) for k in range(x.lanes)]
+            numbers = [builder.extract_element(arguments[0], place) for place in places]
+            while len(numbers) > 1:  # (0 + 1) + (2 + 3)
+                neighbours = zip(numbers[::2], numbers[1::2], strict=True)
+                numbers = [builder.fadd(a, b, flags=FLAGS) for a, b in neighbours]
+            sums += numbers
+        if parts == 1:
+            return sums[0]
+        value = context.make_complex(builder, x.dtype)
+        value.real, value.imag = sums
+        return value._getvalue()
+
+    return x.dtype(x), write
 
 
-@intrinsic
-def _above(typingctx, x, limit):
-    kind = Register(types.float64 if x.dtype == types.complex128 else x.dtype, x.lanes)
+@_compiled(above)
+def _above(x, limit):
+    kind = _real_kind(x)
 
-    def generate(context, builder, signature, arguments):
+    def write(context, builder, signature, arguments):
         value = _real_parts(builder, x, arguments[0])
-        truth = builder.fcmp_ordered(">", value, arguments[1])
-        return builder.uitofp(truth, _vector(kind))
+        bound = _as(context, builder, arguments[1], limit, kind)
+        return builder.uitofp(builder.fcmp_ordered(">", value, bound), _vector(kind))
 
-    return kind(x, limit), generate
+    return kind(x, limit), write
 
 
-@intrinsic
-def _chosen(typingctx, which, x, y):
-    def generate(context, builder, signature, arguments):
+@_compiled(chosen)
+def _chosen(which, x, y):
+    def write(context, builder, signature, arguments):
         mask = arguments[0]
         if x.dtype == types.complex128:
             mask = _shuffle(builder, mask, mask, [k // 2 for k in range(2 * x.lanes)])
         half = ir.Constant(mask.type, mask.type.count * [0.5])
         return builder.select(builder.fcmp_ordered(">", mask, half), *arguments[1:])
 
-    return x(which, x, y), generate
+    return x(which, x, y), write
 
 
-@intrinsic
-def _positive(typingctx, record):
-    def generate(context, builder, signature, arguments):
+@_compiled(positive)
+def _positive(record):
+    def write(context, builder, signature, arguments):
         value = _real_parts(builder, record, arguments[0])
         zeros = ir.Constant(value.type, None)
         return _all(builder, builder.fcmp_ordered(">", value, zeros))
 
-    return types.boolean(record), generate
+    return types.boolean(record), write
 
 
 @intrinsic
@@ -596,7 +633,7 @@ def _exponent_and_fraction(typingctx, record):
     return result(record), generate
 
 
-@jit
+@inner_jit
 def _log(x):
     """ln x = k ln 2 + 2 artanh(s), s = (m - 1) / (m + 1), where x = 2^k m; |s| < 0.1716."""
     k, m = _exponent_and_fraction(x)
@@ -616,86 +653,13 @@ def _log(x):
 LN2 = math.log(2.0)
 
 
-def _compile_as(definition, operation):
-    """Compiled, a function of this module is an operation with the same arguments."""
-    overload(definition)(lambda *arguments: lambda *arguments: operation(*arguments))
-
-
-for _definition, _operation in (
-    (load, _load),
-    (nothing, _nothing),
-    (store, _store),
-    (four, _four),
-    (put_four, _put_four),
-    (number, _number),
-    (set_number, _set_number),
-    (real, _real),
-    (whole, _whole),
-    (least, _least),
-    (greatest, _greatest),
-    (chosen, _chosen),
-    (positive, _positive),
-):
-    _compile_as(_definition, _operation)
-
-
-@overload(pair)
-def _overload_pair(a, b):
-    return lambda a, b: _pack((a, b))
-
-
-@overload(pack)
-def _overload_pack(a, b, c, d):
-    return lambda a, b, c, d: _pack((a, b, c, d))
-
-
-@overload(total)
-def _overload_total(x):
-    if x.lanes == 2:
-        return lambda x: x[0] + x[1]
-    return lambda x: (x[0] + x[1]) + (x[2] + x[3])
-
-
-@overload(cell_coordinate)
-def _overload_cell_coordinate(x, per_dx):
-    if isinstance(x, Register):
-        return lambda x, per_dx: _cell_coordinate(x, _as(per_dx, x))
-    return lambda x, per_dx: _cell_coordinate(x, per_dx)
-
-
-@overload(fused)
-def _overload_fused(a, b, c):
-    if types.complex128 in (a, b, c):
-        return lambda a, b, c: complex(_fused(a.real, b.real, c.real), (a * b + c).imag)
-    return lambda a, b, c: _fused(a, b, c)
-
-
-@overload(product)
-def _overload_product(x, y):
-    if types.complex128 in (x.dtype, y.dtype):
-        return lambda x, y: x * y
-    return lambda x, y: _product(x, y)
-
-
-@overload(within)
-def _overload_within(x, low, high):
-    return lambda x, low, high: _within(x, _as(low, x), _as(high, x))
-
-
-@overload(above)
-def _overload_above(x, limit):
-    return lambda x, limit: _above(x, _as(limit, real(x)))
-
-
 @overload(reciprocal)
 def _overload_reciprocal(x):
-    if x.dtype != types.complex128:
-        return lambda x: _divide(_as(1.0, x), x)
-    return lambda x: _pack((1.0 / x[0], 1.0 / x[1], 1.0 / x[2], 1.0 / x[3]))
+    return lambda x: pack(1.0 / x[0], 1.0 / x[1], 1.0 / x[2], 1.0 / x[3])
 
 
 @overload(logarithm)
 def _overload_logarithm(x):
     if x.dtype != types.complex128:
         return lambda x: _log(x)
-    return lambda x: _pack((np.log(x[0]), np.log(x[1]), np.log(x[2]), np.log(x[3])))
+    return lambda x: pack(np.log(x[0]), np.log(x[1]), np.log(x[2]), np.log(x[3]))
