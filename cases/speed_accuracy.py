@@ -597,7 +597,17 @@ def at_equal_accuracy(
                 row["known to"] = f"{least:.2%}"
                 if any(map(math.isfinite, found.values())):
                     rows.append(row)
-    return rows
+    return without_repeats(rows, ("scene", "of the", "updated, s", "total, s"))
+
+
+def without_repeats(rows: list[dict[str, str]], names: Sequence[str]) -> list[dict[str, str]]:
+    """Those whose next one differs: of several errors that cost the same only the least is told."""
+    last = [[row[name] for name in names] for row in rows[1:]]
+    return [
+        row
+        for row, after in itertools.zip_longest(rows, last)
+        if after != [row[name] for name in names]
+    ]
 
 
 def evaluations(point: Point) -> list[Callable[[], object]]:
@@ -681,7 +691,7 @@ def against_peers(
             row[f"peer, {how}, s"] = f"{np.median(theirs[fastest]):.3g}, {fastest}"
             row[f"times, {how}"] = f"{ratio(theirs[fastest], ours):.1f}"
         rows.append(row)
-    return rows
+    return without_repeats(rows, ("scene", "s", "particles x steps"))
 
 
 def write_csv(path: Path, rows: Sequence[dict[str, str]]) -> None:

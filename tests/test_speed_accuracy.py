@@ -131,7 +131,7 @@ def test_peers_take_as_long_as_the_particles_and_steps_that_mls_mpm_needs(monkey
     monkeypatch.setattr(speed_accuracy, "in_turns", in_turns)
     points = [point(32, 1.0, PLAIN), point(16, 0.5, TOTAL)]
     rows = speed_accuracy.against_peers(points, {"bar": (0.06, 0.1)}, 3)
-    assert [row["off by at most"] for row in rows] == ["20 %", "15 %", "10 %"]
+    assert [row["off by at most"] for row in rows] == ["10 %"]  # others cost the same
     # 32 x 2 cells of four particles, 100 steps: at 1.5 s for a million of them, against 0.01 s.
     assert rows[-1]["peer, alone, s"] == "0.0384, Warp"
     assert rows[-1]["times, alone"] == "3.8"
