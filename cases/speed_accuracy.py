@@ -743,8 +743,8 @@ STYLES = {PLAIN.name: "-", TOTAL.name: ":"}
 COLOURS = {32: "#9e9e9e", 64: "#1f77b4", 128: "#e07b00", 256: "#2a9d3a"}
 TITLES = {
     "bar": "(a) vibrating bar, against the exact answer",
-    "walker": "(b) walker",
-    "crawler": "(c) crawler",
+    "walker": "(b) walker on walls",
+    "crawler": "(c) crawler on walls",
     "walker on ground": "(d) walker on ground, viscous",
     "crawler on ground": "(e) crawler on ground, viscous",
 }
