@@ -509,21 +509,65 @@ ERRORS = {"distance": "travel_error", "gradient": "gradient_error"}
 LEVELS = (0.2, 0.15, 0.1, 0.05, 0.02, 0.01, 0.005, 0.001)
 
 
-def enough(points: Sequence[Point], level: float, error: str = "travel_error") -> Point | None:
-    """The fastest of some points that is off by at most so much, and not by chance.
+@dataclass(frozen=True)
+class Cost:
+    """What an error costs, on a line of points that differ in cells alone.
 
-    The same with finer cells must be so too, as in `discretisation.cheapest`.
+    Attributes
+    ----------
+    coarse : Point or None
+        The finest that is off by more; None if there is none.
+    fine : Point
+        The next finer one.
+    share : float
+        Of the way between them, in logarithms, at which the error is as wanted.
     """
-    own = [p for p in points if p.choice not in PEERS and p.measured.seconds > 0.0]
 
-    def reached(point: Point) -> bool:
-        return getattr(point, error) <= level and all(
-            getattr(other, error) <= level
-            for other in own
-            if other.n > point.n and (other.courant, other.choice) == (point.courant, point.choice)
-        )
+    coarse: Point | None
+    fine: Point
+    share: float = 1.0
 
-    return min(filter(reached, own), key=lambda p: p.measured.seconds, default=None)
+    def __str__(self) -> str:
+        cells = f"{self.coarse.n} to {self.fine.n}" if self.coarse else f"{self.fine.n}"
+        return f"n = {cells}, Courant {self.fine.courant:g}, {self.fine.choice}"
+
+    def between(self, number: Callable[[Point], float]) -> float:
+        """A number of points there: a power of the error, as of both ends."""
+        if self.coarse is None:
+            return number(self.fine)
+        return float(number(self.coarse) ** (1.0 - self.share) * number(self.fine) ** self.share)
+
+    @property
+    def seconds(self) -> float:
+        return self.between(lambda point: point.measured.seconds)
+
+
+def cost(points: Sequence[Point], level: float, error: str = "travel_error") -> Cost | None:
+    """The least that some points take to be off by at most so much, and not by chance.
+
+    All with finer cells must be so too, as in `discretisation.cheapest`. Between two numbers of
+    cells errors and costs are taken as powers of the cells, so that none is favoured by the cells
+    that were chosen.
+    """
+    lines: dict[tuple[float, str], list[Point]] = {}
+    for point in sorted(points, key=lambda p: p.n):
+        if point.choice not in PEERS and point.measured.seconds > 0.0:
+            lines.setdefault((point.courant, point.choice), []).append(point)
+    found = []
+    for line in lines.values():
+        errors = [getattr(point, error) for point in line]
+        first = len(line)
+        while first > 0 and errors[first - 1] <= level:
+            first -= 1
+        if first == len(line):
+            continue
+        if first == 0:
+            found.append(Cost(None, line[0]))
+        else:
+            above, below = errors[first - 1], max(errors[first], 1e-12)
+            share = math.log(above / level) / math.log(above / below)
+            found.append(Cost(line[first - 1], line[first], share))
+    return min(found, key=lambda each: each.seconds, default=None)
 
 
 def of(points: Sequence[Point], scene: str, formulation: Formulation) -> list[Point]:
@@ -544,18 +588,26 @@ def at_equal_accuracy(
                 row = {"scene": name, "of the": what, "off by at most": f"{100.0 * level:g} %"}
                 found = {}
                 for formulation in FORMULATIONS:
-                    best = enough(of(points, name, formulation), level, error)
-                    found[formulation] = best.measured.seconds if best else math.nan
-                    row[formulation] = (
-                        f"n = {best.n}, Courant {best.courant:g}, {best.choice}" if best else "none"
-                    )
+                    best = cost(of(points, name, formulation), level, error)
+                    found[formulation] = best.seconds if best else math.nan
+                    row[formulation] = f"{best}" if best else "none"
                     row[f"{formulation}, s"] = f"{found[formulation]:.3g}" if best else ""
                 times = found["updated"] / found["total"]
                 row["times"] = f"{times:.1f}" if math.isfinite(times) else ""
                 row["known to"] = f"{least:.2%}"
                 if any(map(math.isfinite, found.values())):
                     rows.append(row)
-    return rows
+    return without_repeats(rows, ("scene", "of the", "updated, s", "total, s"))
+
+
+def without_repeats(rows: list[dict[str, str]], names: Sequence[str]) -> list[dict[str, str]]:
+    """Those whose next one differs: of several errors that cost the same only the least is told."""
+    last = [[row[name] for name in names] for row in rows[1:]]
+    return [
+        row
+        for row, after in itertools.zip_longest(rows, last)
+        if after != [row[name] for name in names]
+    ]
 
 
 def evaluations(point: Point) -> list[Callable[[], object]]:
@@ -598,13 +650,13 @@ def against_peers(
     for name, (least, _) in apart.items():
         mine = [p for p in points if p.scene == name and p.choice in SWEPT]
         for level in (level for level in LEVELS if level >= least):
-            updated, total = (enough(of(mine, name, which), level) for which in FORMULATIONS)
+            updated, total = (cost(of(mine, name, which), level) for which in FORMULATIONS)
             if updated and total:
                 wanted.append((level, updated, total))
     # Cells so few that a peer's own overhead counts are not held against it.
-    sizes = [max(updated.n, 128) for _, updated, _ in wanted]
+    sizes = [max(updated.fine.n, 128) for _, updated, _ in wanted]
     runs: dict[str, Callable[[], object]] = {
-        label(total): several(*evaluations(total)) for _, _, total in wanted
+        label(total.fine): several(*evaluations(total.fine)) for _, _, total in wanted
     }
     with ExitStack() as stack:
         own = {
@@ -622,11 +674,12 @@ def against_peers(
     os.environ["MPMOPT_THREADS"] = "1"
     rows = []
     for (level, updated, total), n in zip(wanted, sizes):
-        count, ours = particles(updated) * updated.steps, seconds[label(total)] / 2.0
+        count = updated.between(lambda point: particles(point) * point.steps)
+        shorter = total.seconds / total.fine.measured.seconds
+        ours = seconds[label(total.fine)] / 2.0 * shorter
         row = {
-            "scene": total.scene, "off by at most": f"{100.0 * level:g} %",
-            "total": f"n = {total.n}, Courant {total.courant:g}", "s": f"{np.median(ours):.3g}",
-            "MLS-MPM": f"n = {updated.n}, Courant {updated.courant:g}",
+            "scene": total.fine.scene, "off by at most": f"{100.0 * level:g} %",
+            "total": f"{total}", "s": f"{np.median(ours):.3g}", "MLS-MPM": f"{updated}",
             "particles x steps": f"{count:.2g}",
         }  # fmt: skip
         for how, scenes in (("alone", 1), ("two", 2)):
@@ -638,7 +691,7 @@ def against_peers(
             row[f"peer, {how}, s"] = f"{np.median(theirs[fastest]):.3g}, {fastest}"
             row[f"times, {how}"] = f"{ratio(theirs[fastest], ours):.1f}"
         rows.append(row)
-    return rows
+    return without_repeats(rows, ("scene", "s", "particles x steps"))
 
 
 def write_csv(path: Path, rows: Sequence[dict[str, str]]) -> None:
@@ -690,8 +743,8 @@ STYLES = {PLAIN.name: "-", TOTAL.name: ":"}
 COLOURS = {32: "#9e9e9e", 64: "#1f77b4", 128: "#e07b00", 256: "#2a9d3a"}
 TITLES = {
     "bar": "(a) vibrating bar, against the exact answer",
-    "walker": "(b) walker",
-    "crawler": "(c) crawler",
+    "walker": "(b) walker on walls",
+    "crawler": "(c) crawler on walls",
     "walker on ground": "(d) walker on ground, viscous",
     "crawler on ground": "(e) crawler on ground, viscous",
 }
