@@ -27,9 +27,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
-from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -38,11 +36,10 @@ import h5py
 import numpy as np
 import peers
 import walker
-from benchmark import in_turns, processor, ratio, several
+from benchmark import processor
 from exact import Bar, manufactured_error
 from matplotlib.artist import Artist
 from matplotlib.patches import Rectangle
-from peers.pace import Runner, together
 
 from mpmopt.app.sweeps import connected, results, sweep
 from mpmopt.assess.discretisation import Discretisation, Measured, density, measure, timed
@@ -143,7 +140,7 @@ SINGLE = Choice("single precision", "^", precision="single")
 TOTAL = Choice("total Lagrangian", "D", formulation="total")
 SWEPT = (PLAIN.name, TOTAL.name)  # over cells and Courant numbers
 FORMULATIONS: tuple[Formulation, ...] = ("updated", "total")
-PACED = {"Taichi": "taichi_mpm", "Warp": "warp_mpm"}  # JAX is slower
+BOTH = 1.07  # two scenes side by side take this many times as long as one: benchmark.rst
 PEERS = {
     "Taichi, double": ("taichi_mpm", "taichi", "*"),
     "Taichi, single": ("taichi_mpm", "taichi", "h"),
@@ -610,23 +607,6 @@ def without_repeats(rows: list[dict[str, str]], names: Sequence[str]) -> list[di
     ]
 
 
-def evaluations(point: Point) -> list[Callable[[], object]]:
-    """Two that may run side by side, of what a point is."""
-    if point.scene == "bar":
-        bars = [Bar(point.n, point.courant, formulation=point.formulation) for _ in range(2)]
-        return [bar.value_and_gradient for bar in bars]
-    scene, phi = ROBOTS[point.scene]
-    choice = PLAIN if point.formulation == "updated" else TOTAL
-    here = laid_out(scene, point.n, point.courant, choice)
-    problems = [here.problem(scene, BETA, limits=None) for _ in range(2)]
-    return [partial(problem.evaluate, design(phi)(problem)) for problem in problems]
-
-
-def label(point: Point) -> str:
-    """What is told of it beside the scene's other points."""
-    return f"{point.scene}, n = {point.n}, Courant {point.courant:g}, {point.formulation}"
-
-
 def particles(point: Point) -> int:
     """Of the whole body: peers know no plane of symmetry."""
     if point.scene == "bar":
@@ -636,61 +616,39 @@ def particles(point: Point) -> int:
 
 
 def against_peers(
-    points: Sequence[Point], apart: dict[str, tuple[float, float]], rounds: int
+    points: Sequence[Point], apart: dict[str, tuple[float, float]]
 ) -> list[dict[str, str]]:
     """How many times as long as ours in total Lagrangian the fastest peer takes at equal accuracy.
 
     Peers do MLS-MPM and compute our numbers to 1e-13, so they need the cells and steps that ours
-    needs in double precision. What they take for a particle and step is measured with the paper's
-    walker on such cells, as they know no ground with a layer. All is elapsed time on all
-    processors: two scenes side by side in total Lagrangian, the peer alone, and two of the peer
-    side by side.
+    needs in double precision. What they take for a particle and step is that of the walker on
+    walls, as they know no ground with a layer. All is processor time: what counts where every
+    processor has a scene of its own.
     """
-    wanted = []
+    pace = {
+        p.choice: p.measured.seconds / (particles(p) * p.steps)
+        for p in points
+        if p.scene == "walker" and p.choice in PEERS and "double" in p.choice
+    }
+    fastest = min(pace, key=lambda choice: pace[choice])
+    rows = []
     for name, (least, _) in apart.items():
         mine = [p for p in points if p.scene == name and p.choice in SWEPT]
         for level in (level for level in LEVELS if level >= least):
             updated, total = (cost(of(mine, name, which), level) for which in FORMULATIONS)
-            if updated and total:
-                wanted.append((level, updated, total))
-    # Cells so few that a peer's own overhead counts are not held against it.
-    sizes = [max(updated.fine.n, 128) for _, updated, _ in wanted]
-    runs: dict[str, Callable[[], object]] = {
-        label(total.fine): several(*evaluations(total.fine)) for _, _, total in wanted
-    }
-    with ExitStack() as stack:
-        own = {
-            (module, n): [
-                stack.enter_context(Runner(module, n, round(1000 * (128 / n) ** 2)))
-                for _ in range(2)
-            ]
-            for module, n in itertools.product(PACED.values(), sorted(set(sizes)))
-        }
-        work = {which: max(runner.ready() for runner in two) for which, two in own.items()}
-        for (module, n), two in own.items():
-            runs[f"{module} {n} alone"] = partial(together, two[0])
-            runs[f"{module} {n} two"] = partial(together, *two)
-        seconds = in_turns(runs, rounds)
-    os.environ["MPMOPT_THREADS"] = "1"
-    rows = []
-    for (level, updated, total), n in zip(wanted, sizes):
-        count = updated.between(lambda point: particles(point) * point.steps)
-        shorter = total.seconds / total.fine.measured.seconds
-        ours = seconds[label(total.fine)] / 2.0 * shorter
-        row = {
-            "scene": total.fine.scene, "off by at most": f"{100.0 * level:g} %",
-            "total": f"{total}", "s": f"{np.median(ours):.3g}", "MLS-MPM": f"{updated}",
-            "particles x steps": f"{count:.2g}",
-        }  # fmt: skip
-        for how, scenes in (("alone", 1), ("two", 2)):
-            theirs = {
-                peer: seconds[f"{module} {n} {how}"] / scenes * (count / work[module, n])
-                for peer, module in PACED.items()
-            }
-            fastest = min(theirs, key=lambda peer: float(np.median(theirs[peer])))
-            row[f"peer, {how}, s"] = f"{np.median(theirs[fastest]):.3g}, {fastest}"
-            row[f"times, {how}"] = f"{ratio(theirs[fastest], ours):.1f}"
-        rows.append(row)
+            if not (updated and total):
+                continue
+            count = updated.between(lambda point: particles(point) * point.steps)
+            times = count * pace[fastest] / total.seconds
+            rows.append(
+                {
+                    "scene": name, "off by at most": f"{100.0 * level:g} %",
+                    "total": f"{total}", "s": f"{total.seconds:.3g}", "MLS-MPM": f"{updated}",
+                    "particles x steps": f"{count:.3g}", "fastest peer": fastest,
+                    "its s": f"{count * pace[fastest]:.3g}", "times": f"{times:.1f}",
+                    "times, elapsed, if it runs alone": f"{times * 2.0 / BOTH:.1f}",
+                }
+            )  # fmt: skip
     return without_repeats(rows, ("scene", "s", "particles x steps"))
 
 
@@ -936,8 +894,7 @@ def chart(path: Path, bench: Bench, quick: bool, peers: bool) -> None:
     write_csv(Path(f"{path}_equal.csv"), at_equal_accuracy(points, on_both))
     write_csv(Path(f"{path}_limits.csv"), [tends[each].row(references[each]) for each in tends])
     if peers:
-        rounds = 3 if quick else 5
-        write_csv(Path(f"{path}_peers.csv"), against_peers(points, on_both, rounds))
+        write_csv(Path(f"{path}_peers.csv"), against_peers(points, on_both))
     if not quick:
         write_csv(Path(f"{path}_horizon.csv"), horizons(bench))
         write_csv(Path(f"{path}_manufactured.csv"), manufactured())

@@ -2,9 +2,7 @@
 
 import csv
 import math
-from contextlib import nullcontext
 from dataclasses import replace
-from types import SimpleNamespace
 
 import h5py
 import numpy as np
@@ -108,37 +106,21 @@ def test_the_time_at_equal_accuracy_is_of_points_that_are_not_right_by_chance():
     assert [*rows][-1] == "0.5 %"  # what the reference itself does not know is left out
 
 
-def test_peers_take_as_long_as_the_particles_and_steps_that_mls_mpm_needs(monkeypatch):
-    def point(n, seconds, choice, scene="bar"):
-        here = Discretisation((n, n), 100, formulation=choice.formulation)
-        return Point(
-            scene, n, 100, 0.4, choice.name, Measured(here, seconds, travel=1.0), travel_error=0.04
-        )
+def test_peers_take_as_long_as_the_particles_and_steps_that_mls_mpm_needs():
+    def point(n, seconds, choice, scene="bar", formulation="updated"):
+        measured = Measured(Discretisation((n, n), 100, formulation=formulation), seconds)
+        return Point(scene, n, 100, 0.4, choice, measured, travel_error=0.04)
 
-    asked = []
-
-    def runner(module, cells, steps):
-        asked.append((module, cells, steps))
-        return nullcontext(SimpleNamespace(ready=lambda: 1_000_000))
-
-    def in_turns(runs, rounds):
-        assert rounds == 3
-        seconds = {"taichi_mpm 128 alone": 2.0, "taichi_mpm 128 two": 3.0}
-        seconds |= {"warp_mpm 128 alone": 1.5, "warp_mpm 128 two": 3.6}
-        return {name: np.full(3, seconds.get(name, 0.02)) for name in runs}
-
-    monkeypatch.setattr(speed_accuracy, "Runner", runner)
-    monkeypatch.setattr(speed_accuracy, "in_turns", in_turns)
-    points = [point(32, 1.0, PLAIN), point(16, 0.5, TOTAL)]
-    rows = speed_accuracy.against_peers(points, {"bar": (0.06, 0.1)}, 3)
-    assert [row["off by at most"] for row in rows] == ["10 %"]  # others cost the same
-    # 32 x 2 cells of four particles, 100 steps: at 1.5 s for a million of them, against 0.01 s.
-    assert rows[-1]["peer, alone, s"] == "0.0384, Warp"
-    assert rows[-1]["times, alone"] == "3.8"
-    assert rows[-1]["peer, two, s"] == "0.0384, Taichi"
-    assert set(asked) == {("taichi_mpm", 128, 1000), ("warp_mpm", 128, 1000)}
+    points = [point(32, 1.0, PLAIN.name), point(16, 0.01, TOTAL.name, formulation="total")]
+    for peer, seconds in (("Taichi, double", 0.4), ("Warp, double", 0.32), ("Taichi, single", 0.1)):
+        points.append(point(128, seconds, peer, "walker"))
+    (row,) = speed_accuracy.against_peers(points, {"bar": (0.06, 0.1)})
+    # 3200 particles and 100 steps in 0.32 s are a microsecond; the bar has 32 x 2 cells of four.
+    assert row["off by at most"] == "10 %"  # others cost the same
+    assert (row["fastest peer"], row["its s"]) == ("Warp, double", "0.0256")
+    assert row["times"] == "2.6"
     # Of a robot with a plane of symmetry they do both halves.
-    whole = speed_accuracy.particles(point(64, 1.0, PLAIN, "crawler on ground"))
+    whole = speed_accuracy.particles(point(64, 1.0, PLAIN.name, "crawler on ground"))
     scene = speed_accuracy.laid_out(ROBOTS["crawler on ground"][0], 64, 0.2, PLAIN)
     half = len(discretise(scene.scene(ROBOTS["crawler on ground"][0])).position)
     assert whole == 2 * half
