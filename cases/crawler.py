@@ -101,7 +101,7 @@ def two_pairs(positions: np.ndarray) -> np.ndarray:
 
 START = {"phi": black_and_white(two_pairs), "a": 0.8, "theta": 0.6, "b": -0.3, "omega": 0.7}
 
-# A stronger core goes a third faster, but stretches until MLS-MPM tears it.
+# A stronger core goes faster, but stretches until MLS-MPM tears it.
 TASK = Task(
     subject_to=(IN_ONE_PIECE,),
     scenes=(

@@ -20,7 +20,7 @@ HEADER = (
     "robot", "mean speed", "worst at friction 0.3 to 0.8", "kept at half the step",
     "on cells half as wide", "a quarter as wide", "in the other formulation", "driven share",
     "pieces", "thinnest member", "goes on for", "without grey, over the solid block",
-    "gradients", "of them failed", "seconds",
+    "gradients", "of them failed",
 )  # fmt: skip
 
 
@@ -59,7 +59,6 @@ def row(folder: Path) -> list[str]:
         number(None if solid is None or block is None else solid - block),
         str(summary["evaluations"]),
         str(summary["failed_evaluations"]),
-        f"{summary['seconds']:.0f}",
     ]
 
 
