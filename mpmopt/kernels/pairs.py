@@ -19,7 +19,7 @@ from mpmopt.kernels.overlap import FAR
 # Distance d_c below which two particles push each other, in cells.
 REACH = 0.75
 # By how much nearness of cells reaches beyond that, in cells.
-SKIN = 1.0
+SKIN = 1.5
 # Part of it that a node may move before the list is renewed: half, less what is rounding.
 HALF = 0.499
 # Where nodes are that were nowhere yet.
@@ -203,12 +203,13 @@ def cell_of(touch, n):
 def are_near(boxes, n, m, reach, touch):
     """Whether two cells are nearer than `reach`, and hold particles that were far apart."""
     c, d, rim = cell_of(touch, n), cell_of(touch, m), 1.0 - 1.0 / touch.per_cell
-    gap = apart = 0.0
-    for axis in range(2):
-        far = abs(touch.corner[d, axis] - touch.corner[c, axis]) + rim
-        x = max(boxes[m, axis] - boxes[n, 2 + axis], boxes[n, axis] - boxes[m, 2 + axis], 0.0)
-        gap, apart = gap + x * x, apart + far * far
-    return apart > FAR * FAR and gap < reach * reach
+    i = abs(touch.corner[d, 0] - touch.corner[c, 0]) + rim
+    j = abs(touch.corner[d, 1] - touch.corner[c, 1]) + rim
+    if i * i + j * j <= FAR * FAR:
+        return False  # as most are that lie in the same bins
+    x = max(boxes[m, 0] - boxes[n, 2], boxes[n, 0] - boxes[m, 2], 0.0)
+    y = max(boxes[m, 1] - boxes[n, 3], boxes[n, 1] - boxes[m, 3], 0.0)
+    return x * x + y * y < reach * reach
 
 
 @inner_jit
