@@ -212,7 +212,8 @@ def _compiled(definition, *ways):
     def decorate(operation):
         @infer_global(definition)
         class Template(AbstractTemplate):
-            metadata: ClassVar = {"target": "cpu"}  # asked before what is for all targets
+            # asked before what is for all targets
+            metadata: ClassVar = {"target": "cpu"}  # type: ignore[misc]
 
             def generic(self, arguments, _):
                 found = operation(*arguments)
