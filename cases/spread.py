@@ -63,7 +63,6 @@ def row(folder: Path) -> dict[str, Any]:
         "driven share": number(summary["driven_share"]),
         "components": summary["components"],
         "evaluations": summary["evaluations"],
-        "seconds": float(summary["seconds"]),
     }
 
 
