@@ -299,13 +299,12 @@ def peak_memory(contestant: str, steps: int) -> float:
 
 def print_peak_memory(contestant: str, steps: int) -> None:
     """In the process that `peak_memory` starts."""
-    problem, x = problem_of(128, steps)
     if contestant == "total":
-        scene = walker_on_ground(128, 2e-4, 1.0)
-        problem = Problem(replace(scene, steps=steps, transient=0.0))
-        x = problem.join(0.0, 1.0, -0.3, -0.5)
-    simulation = problem.simulation(x)
-    objective = Objective.of(problem.scene, simulation.particles)
+        simulation, objective = on_ground(128, steps)
+    else:
+        problem, x = problem_of(128, steps)
+        simulation = problem.simulation(x)
+        objective = Objective.of(problem.scene, simulation.particles)
     if contestant in ("mpmopt", "total"):
         gradient_of(simulation, objective, Checkpointing())
     else:
