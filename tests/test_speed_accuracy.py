@@ -134,6 +134,7 @@ def test_a_limit_is_where_errors_of_order_two_vanish():
     )
     found = speed_accuracy.Limit("walker on ground", "total", 0.2, cells, measured)
     assert found.extrapolated.travel == pytest.approx(2.0, rel=1e-12)
+    assert found.distance_left == pytest.approx(1.5 / 192**2, rel=1e-9)
     assert found.extrapolated.gradient is measured[-1].gradient
     # The finest gradient is one off, and as long as the square root of two.
     assert found.gradient_left == pytest.approx(1.0 / np.sqrt(2.0), rel=1e-12)
