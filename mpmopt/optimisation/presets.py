@@ -46,11 +46,11 @@ def continuation(time_step: float | None = None, most_iterations: int = 25) -> S
 def gait(most_iterations: int, move_limit: float = 0.02) -> Settings:
     """One stage of plain moving asymptotes with short moves, black and white from the first design.
 
-    Its edges are as wide as a particle, so that no grey is there whose gain could be lost. Every
-    design counts without it all the same, with the least of half the step and cells half as wide,
-    so the best is at least as good as the start, which is a drawing that strides. It needs contact
-    layers, finite friction and viscosity, with which distance is smooth. It also needs the total
-    Lagrangian formulation, whose void may be light. Several actuators need shorter moves.
+    Its edges are as wide as a particle, so that no grey is there whose gain could be lost. A
+    design counts without its void, by the lesser objective with half the step and with cells half
+    as wide, so the best is at least as good as the start, which is a drawing that strides. It needs
+    contact layers, finite friction and viscosity, with which distance is smooth. It also needs the
+    total Lagrangian formulation, whose void may be light. Several actuators need shorter moves.
     """
     return Settings(
         (Stage(100.0, solid=True, refined=True, move_limit=move_limit, subpixel=True),),
