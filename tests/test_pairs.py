@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numba import njit
 from scipy.optimize import brentq
 
 from mpmopt import kernels
@@ -17,22 +16,6 @@ from mpmopt.simulation.checkpoints import Checkpointing
 from mpmopt.simulation.lagrangian import LagrangianSimulation
 
 C = 1 / 16
-
-
-# Kernels of pairs have compiled callers alone.
-@njit
-def nowhere(touch):
-    return pairs.nowhere(touch)
-
-
-@njit
-def renewed(near, nodes, touch):
-    return pairs.renewed(near, nodes, touch)
-
-
-@njit
-def push_apart(near, nodes, touch, force):
-    pairs.push_apart(near, nodes, touch, force)
 
 
 def body(*corners, **changes) -> Scene:
@@ -124,14 +107,14 @@ def test_the_force_is_that_of_all_pairs(rng, corners, changes, per_cell):
     count = len(discretise(scene).position)
     simulation = simulation_of(scene, rng.uniform(0.0, 1.0, count) + 1e-3)
     nodes, touch = simulation.start.copy(), simulation.lattice.touch
-    near, seen = nowhere(touch), 0
+    near, seen = pairs.nowhere(touch), 0
     for _ in range(18):  # crumpled more and more: lists are kept, and made anew
         nodes[:2] += 0.15 * (8 * C - nodes[:2])
         nodes[:2] += 0.05 * C * rng.standard_normal((2, nodes.shape[1]))
-        near, _ = renewed(near, nodes, touch)
+        near, _ = pairs.renewed(near, nodes, touch)
         assert near.cells.tolist() == sorted(near.cells.tolist())  # so that sums have one order
         force = np.zeros_like(nodes)
-        push_apart(near, nodes, touch, force)
+        pairs.push_apart(near, nodes, touch, force)
         expected = by_hand(simulation, nodes)
         assert force[:2] == pytest.approx(expected, rel=1e-12, abs=1e-12)
         seen += np.abs(expected).max() > 0.0
@@ -141,20 +124,20 @@ def test_the_force_is_that_of_all_pairs(rng, corners, changes, per_cell):
 def test_what_moves_alike_keeps_its_lists_but_not_those_of_images(rng):
     whole = simulation_of(body(*FORK))
     touch, nodes = whole.lattice.touch, whole.start.copy()
-    near, _ = renewed(nowhere(touch), nodes, touch)
+    near, _ = pairs.renewed(pairs.nowhere(touch), nodes, touch)
     nodes[:2] += 9.0 * C * rng.uniform(-1.0, 1.0, (2, 1))
-    kept, room = renewed(near, nodes, touch)
-    assert np.array_equal(kept.at, whole.start[:2])
-    assert room == pytest.approx(pairs.HALF * pairs.SKIN * C, rel=1e-9)
+    kept, room = pairs.renewed(near, nodes, touch)
+    assert np.array_equal(kept.cells_at, whole.start[:2])
+    assert room == pytest.approx(pairs.HALF * pairs.WIDE_SKIN * C, rel=1e-9)
     for mirror, corners in ((Mirror("x", 8 * C), IMAGES), (Mirror("y", 8 * C), RAILS)):
         half = simulation_of(body(*corners, mirror=mirror))
         touch, nodes = half.lattice.touch, half.start.copy()
-        near, seen = nowhere(touch), 0
+        near, seen = pairs.nowhere(touch), 0
         for _ in range(8):
             nodes[mirror.normal] += 0.45 * C
-            near, _ = renewed(near, nodes, touch)
+            near, _ = pairs.renewed(near, nodes, touch)
             force, expected = np.zeros_like(nodes), by_hand(half, nodes)
-            push_apart(near, nodes, touch, force)
+            pairs.push_apart(near, nodes, touch, force)
             assert force[:2] == pytest.approx(expected, rel=1e-12, abs=1e-12)
             seen += np.abs(expected).max() > 0.0
         assert 2 <= seen < 8
@@ -312,7 +295,7 @@ def test_void_pushes_nothing_and_solid_takes_no_notice_of_it():
     simulation = simulation_of(scene, stiffness)
     nodes, touch = simulation.start.copy(), simulation.lattice.touch
     nodes[0, nodes[0] > 6.5 * C] -= 6 * C
-    near, _ = renewed(nowhere(touch), nodes, touch)
+    near, _ = pairs.renewed(pairs.nowhere(touch), nodes, touch)
     assert len(near.cells) == 0
 
 

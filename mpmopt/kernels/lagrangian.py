@@ -750,7 +750,7 @@ def advance_lattice(
             press(old, lattice, near, rows, force)
         if room < 0.0:
             touching, room = renewed(touching, old, touch)
-        if len(touching.cells):
+        if len(touching.pairs):
             push_apart(touching, old, touch, force)
         if lattice.mirror_axis >= 0:
             fold(force, lattice)
@@ -809,7 +809,7 @@ def advance_lattice_adjoint(
             fold(force_bar, lattice)
         if room < 0.0:
             touching, room = renewed(touching, old, touch)
-        if len(touching.cells):
+        if len(touching.pairs):
             push_apart_adjoint(touching, old, touch, force_bar, state_bar, bar.grip)
         step = lattice.dt * fastest_of(old)
         moved += step

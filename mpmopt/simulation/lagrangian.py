@@ -147,7 +147,14 @@ class LagrangianSimulation(Simulation):
             axis = mirror.normal
             line = round(mirror.position / dx) - int(low[axis])
             image[:, axis] = 2 * line - 1 - image[:, axis]
-        values = lagrangian.weights(per_cell, dx)[:, :3]
+        values = lagrangian.weights(per_cell, dx)[:, :3].copy()
+        side = pairs.SIDE
+        block_corner, block = np.unique(corner[cells] // side * side, axis=0, return_inverse=True)
+        blocks = np.full((len(block_corner), side * side), -1)
+        blocks[block, (corner[cells] % side) @ [side, 1]] = cells
+        block_image = block_corner.copy()
+        if mirror is not None:
+            block_image[:, axis] = 2 * line - side - block_image[:, axis]
         return pairs.Touch(
             dx=dx,
             per_cell=per_cell,
@@ -156,9 +163,12 @@ class LagrangianSimulation(Simulation):
             corner=np.concatenate([corner, image]),
             first=first,
             offset=offset,
+            values=values,
             weights=np.einsum("am,bn->abmn", values, values).reshape(per_cell**2, 9),
             grip=grips,
             cells=cells,
+            blocks=blocks,
+            block_corner=np.concatenate([block_corner, block_image]),
             nodes=nodes,
             alone=np.full((2, self.nodes), pairs.NOWHERE),
         )
