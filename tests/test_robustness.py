@@ -288,6 +288,9 @@ def test_no_share_of_a_robot_that_stays_where_it_is(told):
         told(rest if nominal is None else {**rest, "nominal": nominal})
         found = study_of(on_ground())
         assert found["speed"] == nominal
+        if nominal is not None:
+            back = found["failures"]["shares"].startswith(robustness.GOES_BACK)
+            assert back is (nominal < 0.0)
         assert {*found["kept"].values(), found["driven_share"], found["after_push"]} == {None}
 
 
