@@ -508,8 +508,7 @@ def _speeds(
         trial = trials[name]
 
         def simulated(there: Scene) -> float:
-            shorter_step = trial._replace(scene=lambda: there)
-            return speed(robot, trial if there is scene else shorter_step, most_work)
+            return speed(robot, trial._replace(scene=lambda: there), most_work)
 
         try:
             scene = trial.scene()
