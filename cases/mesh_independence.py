@@ -1,6 +1,6 @@
 """Does the grid matter? A robot on the layer of ground and on clamped nodes, on several cells.
 
-    python cases/mesh_independence.py --out DIR [--quick | --redraw]
+    python cases/mesh_independence.py --out DIR [--quick]
 
 The robot is the walker drawn by hand: the same lines, laid out in cells of a width of 1/64, 1/128
 and 1/256. Measured are the displacement of its beam, which the objective is made of, after two
@@ -10,7 +10,6 @@ its objective is linear. Writes
 """
 
 import argparse
-import csv
 import sys
 import time
 from dataclasses import dataclass, replace
@@ -250,14 +249,7 @@ def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of results")
     parser.add_argument("--quick", action="store_true", help="only 64 cells, for 0.2 seconds")
-    parser.add_argument("--redraw", action="store_true", help="only the figure, of the table there")
     arguments = parser.parse_args(argv)
-    if arguments.redraw:
-        with (arguments.out / "mesh_independence.csv").open(encoding="utf-8") as file:
-            table = list(csv.DictReader(file))
-        kept = [{k: float(v) if k.endswith(" cells") else v for k, v in r.items()} for r in table]
-        plot(arguments.out / "mesh_independence.png", kept)
-        return 0
     arguments.out.mkdir(parents=True, exist_ok=True)
     rows = over_cells_and_steps(arguments.quick)
     replace_file(arguments.out / "mesh_independence.csv", as_csv(rows, 3).encode())

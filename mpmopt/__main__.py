@@ -457,7 +457,7 @@ def _parser() -> argparse.ArgumentParser:
         "--forces", action="store_true", help="arrows: what ground and walls push bodies with"
     )
     command.add_argument("--mp4", action="store_true", help="film.mp4 instead of film.gif")
-    add_place(command, "FILE", "ends in .gif or .mp4 (default: film.gif there)")
+    add_place(command, "FILE", "ends in .gif or .mp4 (default: film.gif, or finished.gif, there)")
     command.add_argument(
         "--seconds", type=float, help="that it plays (default: so that each period is seen)"
     )

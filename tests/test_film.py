@@ -102,7 +102,8 @@ def test_a_film_of_the_finished_robot_shows_the_seconds_that_its_speed_is_of(tmp
 
 def test_a_scene_without_ground_has_no_finished_robot_to_film(short_path, tmp_path, capsys):
     assert main(["film", str(short_path), "--finished", "--out", str(tmp_path / "a.gif")]) == 1
-    assert "no actuator or no ground" in capsys.readouterr().err
+    said = " ".join(capsys.readouterr().err.split())
+    assert "no actuator or no ground, so there is no speed to film; leave --finished" in said
 
 
 def test_bodies_are_where_their_particles_are_and_move(short_run):

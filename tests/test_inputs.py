@@ -1,8 +1,10 @@
 """What users hand over: other kinds work where they can only mean one thing, or are named."""
 
+import copy
 import dataclasses
 import doctest
 import json
+import pickle
 from inspect import signature
 from typing import Any
 
@@ -17,13 +19,13 @@ from mpmopt.assess.refinement import study
 from mpmopt.assess.threshold import solid_reference
 from mpmopt.design.problem import Problem
 from mpmopt.design.task import Task
-from mpmopt.design.terms import Speed
+from mpmopt.design.terms import Effort, Speed, Volume
 from mpmopt.errors import DesignError, SceneError, SweepError
 from mpmopt.optimisation.loop import begin, check_body_fits, go_on, optimise
 from mpmopt.optimisation.presets import continuation
 from mpmopt.optimisation.settings import STAGES, Settings, Stage
 from mpmopt.results import runfile
-from mpmopt.scene import Actuator, Design, Ground, Material, Mirror, Scene, Solid
+from mpmopt.scene import Actuator, Design, Grid, Ground, Material, Mirror, Scene, Solid
 from mpmopt.simulation.checkpoints import Checkpointing
 from mpmopt.view.live import ProgressBar
 
@@ -124,12 +126,25 @@ def test_few_iterations_need_no_word_about_the_least():
         (Settings, {"most_iteration": 5}, DesignError, "did you mean most_iterations"),
         (Task, {"maximize": None}, DesignError, "did you mean maximise"),
         (Speed, {"aftr": 1.0}, DesignError, "Speed has no field aftr; did you mean after"),
+        (Volume, {"most": 0.4}, DesignError, "Volume has no field most; it has no fields"),
+        (Checkpointing, {"memry": 3}, DesignError, "no field memry; did you mean memory"),
+        (Scene, {}, SceneError, "Scene: missing .* 'grid'; it has grid, "),
+        (Grid, {}, SceneError, "Grid: missing .* 'cells'; it has cells, dx"),
+        (Stage, {}, DesignError, "Stage: missing .* 'beta'; it has beta, "),
         (Case, {"setings": None}, DesignError, "Case has no field setings; did you mean settings"),
     ],
 )
 def test_a_field_that_is_misspelt_or_missing_is_named(kind, named, error, says):
     with pytest.raises(error, match=says):
         kind(**named)
+
+
+@pytest.mark.parametrize("made", [SCENE, STAGE, CASE, Speed(1.0), Effort(), Checkpointing(3)])
+def test_what_is_checked_can_be_copied_and_pickled(made):
+    for again in (copy.copy(made), copy.deepcopy(made), pickle.loads(pickle.dumps(made))):
+        assert again == made and again is not made and type(again) is type(made)
+    with pytest.raises(DesignError, match=r"Volume: too many .* it has no fields"):
+        Volume(0.4)
 
 
 @pytest.mark.parametrize(

@@ -214,18 +214,25 @@ def told(monkeypatch):
 
     def tells(numbers):
         def one(robot, trial, most):
-            name = names.get(id(trial), "with half its step")
+            name = names.get(id(trial.scene()), "with half its step")
             if name not in numbers and not name.startswith("friction"):
                 raise SimulationError("it burst", 3, -1, (0.0, 0.0), "none")
             return numbers.get(name, 0.03)
 
-        names = {}
+        names, scenes = {}, []
         trials = robustness._trials
+
+        def with_own_scene(name, trial):
+            def scene():
+                scenes.append(dataclasses.replace(trial.scene()))  # so that no other has its id
+                names[id(scenes[-1])] = name
+                return scenes[-1]
+
+            return trial._replace(scene=scene)
 
         def remembered(scene, full):
             found = trials(scene, full)
-            names.update({id(trial): name for name, trial in found.items()})
-            return found
+            return {name: with_own_scene(name, trial) for name, trial in found.items()}
 
         monkeypatch.setattr(robustness, "_trials", remembered)
         monkeypatch.setattr(robustness, "speed", one)
@@ -288,6 +295,9 @@ def test_no_share_of_a_robot_that_stays_where_it_is(told):
         told(rest if nominal is None else {**rest, "nominal": nominal})
         found = study_of(on_ground())
         assert found["speed"] == nominal
+        if nominal is not None:
+            back = found["failures"]["shares"].startswith(robustness.GOES_BACK)
+            assert back is (nominal < 0.0)
         assert {*found["kept"].values(), found["driven_share"], found["after_push"]} == {None}
 
 
@@ -402,12 +412,14 @@ def test_a_full_study_is_kept_with_its_run(told, tmp_path, capsys):
     with pytest.raises(DesignError, match="unfinished run"):
         full_study(path)
     run = optimise(scene, SHORT, Problem(scene).join(0.3, 1.0, -0.3, -0.5))
-    runfile.write(path, run, {"evaluations": 2})
+    rows, steps = {"cells half as wide": 0.9}, {"cells half as wide": 1e-3, "cells 2": 5e-4}
+    runfile.write(path, run, {"evaluations": 2, "retained_gain": rows, "shorter_steps": steps})
     text = full_study(path)
     assert "kept, finest cells" in text
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert runfile.read_run(path).summary == summary
     assert (summary["evaluations"], summary["speed"]) == (2, 0.1)
+    assert summary["shorter_steps"] == {"cells half as wide": 1e-3}  # cells 2 needed none now
     assert (tmp_path / "robustness.png").read_bytes().startswith(b"\x89PNG")
     told({})
     assert full_study(path) == text  # it is not made again

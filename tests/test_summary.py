@@ -16,10 +16,11 @@ from mpmopt.app.summary import summarise
 from mpmopt.assess import refinement, robustness, threshold
 from mpmopt.assess.refinement import Variant
 from mpmopt.assess.verdict import DRIVEN, KEPT, verdict
+from mpmopt.design.driven import Driven
 from mpmopt.design.objective import Objective
 from mpmopt.design.problem import Problem
 from mpmopt.design.task import DEFAULT_TASK, AtMost, Task
-from mpmopt.design.terms import Volume
+from mpmopt.design.terms import Displacement, Height, Speed, Volume
 from mpmopt.design.variation import refined
 from mpmopt.errors import SimulationError
 from mpmopt.optimisation import presets
@@ -325,6 +326,8 @@ def test_the_table_at_the_end_says_what_a_number_is_of():
     }  # fmt: skip
     assert "they count in displacement, not in speed" in ending._pieces(summary)
     assert "it stands" in ending._elsewhere(summary)["speed"]
+    back = {**summary, "speed": -0.3, "failures": {"shares": robustness.GOES_BACK}}
+    assert "it goes back" in ending._elsewhere(back)["speed"]
     moved = {**summary, "failures": {}, "followed": {"end": "falls", "seconds": 9.06}}
     assert "at 9.06: falls" in ending._elsewhere(moved)["speed"]
 
@@ -349,11 +352,24 @@ FINGER = {
         (WALKER, {"followed": {"end": "it tore", "seconds": 9.0}}, "fails: at t = 9.00, it tore"),
         (WALKER, {"speed": None, "failures": {"nominal": "it tore"}}, "fails: it tore"),
         (WALKER, {"speed": 1e-4, "failures": {"shares": "too slow"}}, "stands: .* 0.000100"),
+        (
+            WALKER,
+            {"speed": -0.3, "failures": {"shares": f"{robustness.GOES_BACK}: 1"}},
+            r"goes back: its speed along the way is -0\.300$",
+        ),
         (WALKER, {"driven_share": DRIVEN - 0.01}, "slides: only 49%"),
         (WALKER, {"disconnected_particles": 6}, "loose pieces: 6 particles"),
-        (WALKER, {"kept": {"half_step": KEPT - 0.01, "finer_cells": 1.0}}, "doubtful: .*half step"),
+        (
+            WALKER,
+            {"kept": {"half_step": KEPT - 0.01, "finer_cells": 1.0}},
+            "doubtful: .*with half the step$",
+        ),
         (WALKER, {"kept": {"half_step": KEPT, "finer_cells": 1.0}}, "goes: 80% or more"),
-        (WALKER, {"kept": {"half_step": 1.0, "finer_cells": None}}, "doubtful: no speed with fin"),
+        (
+            WALKER,
+            {"kept": {"half_step": 1.0, "finer_cells": None}},
+            "doubtful: no speed with cells half as wide$",
+        ),
         (
             WALKER,
             {
@@ -362,15 +378,49 @@ FINGER = {
             },
             "goes: 100% or more",
         ),
+        (
+            WALKER,
+            {"kept": {"finer_cells": None}, "failures": {"cells 2": robustness.TOO_LONG}},
+            "goes: not compared; mpmopt study compares other discretisations$",
+        ),
+        (
+            WALKER,
+            {
+                "kept": {"finer_cells": None},
+                "failures": {"cells 2": robustness.TOO_LONG},
+                "followed": {"end": "goes on", "seconds": 20.0},
+            },
+            "goes: not compared$",
+        ),
         (FINGER, {}, "gains: 85% or more of its gain"),
         (FINGER, {"post_processed": None}, "fails: .* without its void"),
-        (FINGER, {"gain": {"as designed": 0.0}}, "no gain"),
+        (FINGER, {"gain": {"as designed": 0.0}}, "no gain: the solid block does as well"),
+        (FINGER, {"retained_gain": {"other formulation": 0.5}}, "doubtful: .* the other form"),
         (FINGER, {"disconnected_particles": 1}, "loose pieces"),
         (FINGER, {"retained_gain": {"half the step": 0.5}}, "doubtful: only 50% of its gain with"),
     ],
 )
 def test_a_run_has_a_verdict_in_one_word(whole, changes, says):
     assert re.match(says, verdict({**whole, **changes}))
+
+
+def test_what_is_not_to_travel_is_judged_by_its_gain():
+    jumper = {
+        **WALKER, **FINGER, "speed": 1e-4, "driven_share": None, "failures": {"shares": "slow"},
+        "followed": {"end": "falls", "seconds": 3.0},
+    }  # fmt: skip
+    assert verdict(jumper).startswith("stands")
+    assert verdict(jumper, travels=False) == verdict(FINGER)
+    for terms in (
+        DEFAULT_TASK.maximise,
+        Speed(direction=SCENE.direction),
+        Height() + 2.0 * Driven(Displacement()),
+    ):
+        assert Task(terms).travels(SCENE)
+    for terms in (Height(), Displacement((0.0, 1.0)), Height() - 0.1 * Speed()):
+        assert not Task(terms).travels(SCENE)
+    run = dataclasses.replace(finished(), task=Task(Height()))
+    assert summary.verdict_of(jumper, run) == verdict(FINGER)
 
 
 def test_a_design_that_breaks_a_constraint_has_that_as_its_verdict(told):

@@ -50,8 +50,7 @@ def test_a_constraint_that_cannot_be_met_is_named_with_its_lack():
     value = run.result.constraints[0]
     assert run.result.constraints[0] == min(item.constraints[0] for item in run.history)
     assert run.stop_reason.endswith(
-        f"No design met all constraints: of the best Volume() at most -1 is missed by "
-        f"{value + 1.0:.3g}."
+        f"No design met all constraints: the best breaks Volume() at most -1, is {value:.4g}."
     )
 
 
@@ -89,7 +88,7 @@ def test_of_designs_that_miss_a_constraint_the_nearest_is_the_best(monkeypatch):
     rows = [(9.0, 0.8), (1.0, 0.6), (7.0, 0.7), (8.0, 0.75), (9.0, 0.9)]
     run = told(monkeypatch, rows, BOUND, FIVE)
     assert run.result.objective == 1.0
-    assert re.search(r"Volume\(\) at most 0.5 is missed by 0.1\.$", run.stop_reason)
+    assert re.search(r"breaks Volume\(\) at most 0.5, is 0.6\.$", run.stop_reason)
 
 
 def test_the_result_meets_constraints_though_a_sharper_stage_goes_farther(monkeypatch):

@@ -8,9 +8,8 @@ import os
 from pathlib import Path
 
 from mpmopt.app.case import draw_or_warn
-from mpmopt.app.summary import missed, table
+from mpmopt.app.summary import table, verdict_of
 from mpmopt.assess import robustness
-from mpmopt.assess.verdict import verdict
 from mpmopt.errors import DesignError
 from mpmopt.io.files import locked, replace_file
 from mpmopt.io.notebook import Place, in_notebook
@@ -57,11 +56,13 @@ def full_study(path: str | os.PathLike[str]) -> str:
                 def show(name: str, speed: float) -> None:
                     progress.step(f"{name}: {'failed' if math.isnan(speed) else digits(speed, 3)}")
 
-                shorter = summary.get("shorter_steps", {})
+                # Those of the refinement study, which is not made again, stay.
+                shorter, rows = summary.pop("shorter_steps", {}), summary.get("retained_gain", ())
+                shorter = {name: step for name, step in shorter.items() if name in rows}
                 summary |= robustness.study(problem, x, full=True, progress=show)
-                if shorter:  # of the refinement study too
-                    summary["shorter_steps"] = shorter | summary.get("shorter_steps", {})
-            summary |= {"verdict": verdict(summary, missed(kept.run))}
+                shorter |= summary.pop("shorter_steps", {})
+                summary |= {"shorter_steps": shorter} if shorter else {}
+            summary |= {"verdict": verdict_of(summary, kept.run)}
             text = json.dumps(summary, indent=1) + "\n"
             replace_file(path.parent / "summary.json", text.encode())
             runfile.write(path, kept.run, summary, kept.baseline, kept.full_study)

@@ -24,7 +24,6 @@ from mpmopt.assess.verdict import verdict
 from mpmopt.assess.width import thinnest_member
 from mpmopt.design.actuation import frequencies
 from mpmopt.design.problem import Problem
-from mpmopt.design.task import FEASIBLE
 from mpmopt.design.variables import Variables
 from mpmopt.errors import MissingLibraryError, SimulationError
 from mpmopt.optimisation.history import Optimisation
@@ -112,13 +111,12 @@ def summarise(
         "stop_reason": result.stop_reason,
     }
     found |= {"shorter_steps": shorter} if shorter else {}
-    return {"verdict": verdict(found, missed(result)), **found}
+    return {"verdict": verdict_of(found, result), **found}
 
 
-def missed(result: Optimisation) -> list[str]:
-    """The constraints that the best design breaks, with their values."""
-    pairs = zip(result.task.subject_to, result.result.constraints)
-    return [f"{each}, is {value:.4g}" for each, value in pairs if each.g(value) > FEASIBLE]
+def verdict_of(summary: Mapping[str, Any], result: Optimisation) -> str:
+    """The `verdict` on an optimisation, of which there is a summary."""
+    return verdict(summary, result.missed, result.task.travels(result.scene))
 
 
 def _thinnest_member(problem: Problem, x: NDArray[np.float64]) -> float | None:

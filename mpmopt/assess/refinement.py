@@ -24,7 +24,9 @@ T = TypeVar("T")
 # How often the step is halved where a simulation with other cells, or in the other formulation,
 # fails: what was designed in one need not be stable in the other.
 HALVINGS = 2
-FINER, OTHER = OTHERWISE = "cells half as wide", "other formulation"
+FINER = "cells half as wide"
+OTHER = "other formulation"
+OTHERWISE = FINER, OTHER
 
 
 @dataclass(frozen=True)
@@ -60,9 +62,12 @@ class Variant:
 
 
 def with_shorter_steps(
-    scene: Scene, simulated: Callable[[Scene], T], halvings: int = HALVINGS
+    scene: Scene, simulated: Callable[[Scene], T], halvings: int
 ) -> tuple[T, int]:
     """What a simulation gives, and how often the scene's step was halved until it did.
+
+    No step mends a scene that is none, a body that tears, or parts of one that lie in each other:
+    `SceneError`, `FractureError` and `OverlapError` are not tried again.
 
     Raises
     ------
@@ -77,7 +82,7 @@ def with_shorter_steps(
             return simulated(shorter if halved else scene), halved
         except (SceneError, SimulationError) as error:
             first = first or error
-            if isinstance(error, (SceneError, FractureError, OverlapError)):  # no step mends that
+            if isinstance(error, (SceneError, FractureError, OverlapError)):
                 break
     assert first is not None
     raise first

@@ -11,13 +11,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mpmopt.design.term import Term
-from mpmopt.design.terms import TERMS, Displacement
+from mpmopt.design.driven import Driven
+from mpmopt.design.term import Sum, Term
+from mpmopt.design.terms import TERMS, Displacement, Speed
 from mpmopt.design.variables import Bounded, Frozen, Restriction, Tied
 from mpmopt.design.variation import Variation
 from mpmopt.errors import DesignError
 from mpmopt.scene import Ground, Scene
-from mpmopt.scene.parts import Checked
+from mpmopt.scene.parts import Checked, Vector
 from mpmopt.validation import instance, number, shown
 
 # A constraint counts as met up to this, in its own scale: moving asymptotes come from outside.
@@ -128,6 +129,10 @@ class Task(Checked):
         """The same in a single scene."""
         return Task(self.maximise, self.subject_to)
 
+    def travels(self, scene: Scene) -> bool:
+        """Whether it is travel along the scene's direction that it maximises, among others."""
+        return _travels(self.maximise, scene.direction)
+
     def soft(self, values: NDArray) -> tuple[Any, NDArray]:
         """The soft minimum of the objective's values in all scenes, and its derivatives by them."""
         lowest = values[np.argmin(values.real)]
@@ -175,6 +180,14 @@ DEFAULT_TASK = Task()
 _KINDS = {
     kind.__name__: kind for kind in (Task, AtMost, Variation, Ground, Frozen, Bounded, Tied, *TERMS)
 }
+
+
+def _travels(term: Term, direction: Vector) -> bool:
+    if isinstance(term, Sum):
+        return any(weight > 0.0 and _travels(part, direction) for weight, part in term.terms)
+    if isinstance(term, Driven):
+        return _travels(term.term, direction)
+    return isinstance(term, (Displacement, Speed)) and term.direction in (None, direction)
 
 
 def _plain(value: Any) -> Any:

@@ -142,7 +142,7 @@ class Speed(Term, Checked):
 
 
 @dataclass(frozen=True)
-class Effort(Term):
+class Effort(Term, Checked):
     """Mean square of the actuators' signals, over steps and actuators: between 0 and 4."""
 
     def value(self, outcome: Outcome) -> Any:
@@ -155,7 +155,7 @@ class Effort(Term):
 
 
 @dataclass(frozen=True)
-class Volume(Term):
+class Volume(Term, Checked):
     """Share of the design domain that is material: the mean of gamma, between 0 and 1."""
 
     def value(self, outcome: Outcome) -> Any:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mpmopt.design.objective import Objective
 from mpmopt.design.problem import Problem
-from mpmopt.design.task import Task
+from mpmopt.design.task import FEASIBLE, Task
 from mpmopt.design.terms import Displacement
 from mpmopt.errors import DesignError
 from mpmopt.optimisation.settings import Settings
@@ -236,6 +236,12 @@ class Optimisation:
     def number_of(self, item: Candidate) -> int:
         """Number, from 1, of the evaluation that a design is of: no two are of the same time."""
         return 1 + next(k for k, each in enumerate(self.history) if each.seconds == item.seconds)
+
+    @property
+    def missed(self) -> list[str]:
+        """The constraints that the best design breaks, with their values; none without a design."""
+        pairs = zip(self.task.subject_to, self.result.constraints) if self.best else ()
+        return [f"{each}, is {value:.4g}" for each, value in pairs if each.g(value) > FEASIBLE]
 
     @property
     def measure(self) -> str:

@@ -15,7 +15,7 @@ from mpmopt.assess import refinement
 from mpmopt.assess.threshold import post_processed
 from mpmopt.design.chain import non_discreteness
 from mpmopt.design.problem import Problem
-from mpmopt.design.task import DEFAULT_TASK, FEASIBLE, Task
+from mpmopt.design.task import DEFAULT_TASK, Task
 from mpmopt.design.variables import START, Freedom, completed
 from mpmopt.errors import DesignError, SceneError, SimulationError
 from mpmopt.optimisation.history import Candidate, Iteration, Optimisation, StageState
@@ -191,24 +191,13 @@ def go_on(
         logger.info("stage %d: %s", run.stage, run.reason)
         run.stage += not run.gave_up
     reached = run.stage + run.gave_up
-    run.stop_reason = f"Stage {reached} of {len(stages)} was the last: {run.reason}{_missed(run)}"
+    run.stop_reason = f"Stage {reached} of {len(stages)} was the last: {run.reason}"
+    if run.missed:
+        text = f" No design met all constraints: the best breaks {'; '.join(run.missed)}."
+        logger.warning(text.strip())
+        run.stop_reason += text
     report()
     return run
-
-
-def _missed(run: Optimisation) -> str:
-    """Which constraints the best design misses, and by how much; empty if it meets all."""
-    if not run.best or not run.result.violation:
-        return ""
-    pairs = zip(run.task.subject_to, run.result.constraints)
-    missed = [
-        f"{constraint} is missed by {constraint.g(value) * constraint.scale:.3g}"
-        for constraint, value in pairs
-        if constraint.g(value) > FEASIBLE
-    ]
-    text = f" No design met all constraints: of the best {', '.join(missed)}."
-    logger.warning(text.strip())
-    return text
 
 
 def _rank(item: Iteration) -> tuple[float, float]:

@@ -45,11 +45,10 @@ class Checked:
         """As any object; whether what is given fits the fields is looked at."""
         wanted = signature(cls.__init__)
         try:
-            if values or given:  # a copy begins without
-                wanted.bind(None, *values, **given)
+            wanted.bind(None, *values, **given)
         except TypeError as error:
             names = [name for name in wanted.parameters if name != "self"]
-            says = f": {error}; it has {', '.join(names)}"
+            says = f": {error}; it has {', '.join(names) or 'no fields'}"
             for name in given:
                 if name not in names:
                     nearest = get_close_matches(name, names, 1)
@@ -59,6 +58,10 @@ class Checked:
             kind = SceneError if cls.__module__.startswith("mpmopt.scene.") else DesignError
             raise kind(cls.__name__ + says) from None
         return super().__new__(cls)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """For copies and pickles, which begin without fields."""
+        return object.__new__, (type(self),), self.__dict__
 
     def _set(self, **values: Any) -> None:
         for name, value in values.items():

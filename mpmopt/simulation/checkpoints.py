@@ -18,13 +18,14 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from mpmopt.errors import DesignError, StorageError
+from mpmopt.scene.parts import Checked
 from mpmopt.validation import count, number
 
 MEGABYTE = 1_000_000
 
 
 @dataclass(frozen=True)
-class Checkpointing:
+class Checkpointing(Checked):
     """What the user says about checkpoints; what is left open is chosen from the memory budget.
 
     Parameters
@@ -52,9 +53,9 @@ class Checkpointing:
         name = "Checkpointing"
         if self.every not in (None, "all"):
             every = count(name, 'every (or "all")', self.every, 1, error=DesignError)
-            object.__setattr__(self, "every", every)
+            self._set(every=every)
         memory = number(name, "memory", self.memory, above=0.0, error=DesignError)
-        object.__setattr__(self, "memory", int(memory))
+        self._set(memory=int(memory))
         if self.store not in (None, "memory", "disk"):
             raise DesignError(f'{name}: store = {self.store!r} must be "memory" or "disk"')
 

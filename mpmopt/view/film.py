@@ -230,7 +230,7 @@ def film(
     ------
     DesignError
         If the run has no design, `path` has another ending, `seconds` makes no sense, or there is
-        no finished robot: no actuator or no ground.
+        no speed to film: no actuator or no ground.
     MissingLibraryError
         If a library for the format is not installed.
     SimulationError
@@ -248,7 +248,10 @@ def film(
     scene, begin = problem.scene, 0.0
     if finished:
         if not can_be_studied(scene):
-            raise DesignError("film: the scene has no actuator or no ground, so no finished robot")
+            raise DesignError(
+                "film: the scene has no actuator or no ground, so there is no speed to film; leave "
+                "--finished (finished=True) out"
+            )
         begin, end = (time * unit(scene) for time in (SETTLED, SEEN))
         scene = lasting(scene, end)
     duration = scene.duration - begin

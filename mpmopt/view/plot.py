@@ -171,8 +171,8 @@ GAITS = ("stride", "gait")  # of robots on ground only
 
 def picture_files(folder: Path, scene: Scene) -> dict[str, Path]:
     """The files that `plot_run` writes to a folder, by name."""
-    goes = can_be_studied(scene)
-    return {name: folder / f"{name}.png" for name in PICTURES if goes or name not in GAITS}
+    studied = can_be_studied(scene)
+    return {name: folder / f"{name}.png" for name in PICTURES if studied or name not in GAITS}
 
 
 def plot_run(

@@ -347,7 +347,7 @@ AGAIN = (
 )
 
 
-def _commands(source: Path, goes: bool) -> dict[str, str]:
+def _commands(source: Path, studied: bool) -> dict[str, str]:
     path = str(source.absolute())
     film = command("-m", "mpmopt", "film", path)
     at_speed = {"film the finished robot in the time that its speed is of": f"{film} --finished"}
@@ -358,7 +358,7 @@ def _commands(source: Path, goes: bool) -> dict[str, str]:
         "check its gradients": command("-m", "mpmopt", "verify", path),
         "try it elsewhere, and in other discretisations": command("-m", "mpmopt", "study", path),
         "film it": film,
-        **(at_speed if goes else {}),
+        **(at_speed if studied else {}),
         "take it out, 60 mm wide": command(
             "-m", "mpmopt", "export", path, "--svg", "--width", "60"
         ),
