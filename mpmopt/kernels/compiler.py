@@ -37,8 +37,9 @@ def _digest() -> str:
 
 STAMP = _digest()
 
-# What an index or a sum of numbers means is asked in the order in which meanings were made known.
-# A look into the disk cache would make those of strings, lists and dictionaries known first.
+# Numba tries overloads of an operator in the order of their registration. Reading the disk cache
+# would register those of strings, lists and dictionaries first, and make compiling slower. Numba
+# itself calls this before it compiles.
 cpu_target.typing_context.refresh()
 
 # No "nnan" or "ninf": comparisons must see what is not a number.

@@ -202,11 +202,11 @@ INT32 = ir.IntType(32)
 
 
 def _compiled(definition, *ways):
-    """Decorate what makes the compiled form of a function, or of an operator, on types in `ways`.
+    """Registers type and instructions of a function or an operator.
 
-    It takes the types of the arguments and returns a signature and what writes the instructions,
-    or none. These stand where the call does: nothing else is compiled, and no other meaning of an
-    operator is asked for before.
+    What it decorates takes the types of the arguments, and returns a signature and what writes the
+    instructions, or none. These stand where the call does: no function of its own is compiled.
+    `ways` are the types of arguments that it is for; default: any.
     """
 
     def decorate(operation):
