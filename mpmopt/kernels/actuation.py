@@ -1,10 +1,10 @@
 """What actuators add to the stress: tau += F S F^T, with S the sum of signals times stresses."""
 
-from mpmopt.kernels.compiler import inner_jit
+from mpmopt.kernels.compiler import jit
 from mpmopt.kernels.simd import load, total
 
 
-@inner_jit
+@jit
 def second_piola(data, g, signal):
     """s S of the actuators of four particles: xx, xy, yy."""
     s00 = s01 = s11 = 0.0 * load(data.stiffness, g)
@@ -16,7 +16,7 @@ def second_piola(data, g, signal):
     return s00, s01, s11
 
 
-@inner_jit
+@jit
 def add_actuation(F, S, tau):
     """tau + F S F^T: xx, xy, yy."""
     f00, f01, f10, f11 = F
@@ -28,7 +28,7 @@ def add_actuation(F, S, tau):
     return t00, t01, t11
 
 
-@inner_jit
+@jit
 def actuation_adjoint(F, data, g, signal, tau_bar, signal_bar):
     """F_bar = (T + T^T) F s S with T = tau_bar, whose xy counts xy and yx; adds to signal_bar."""
     f00, f01, f10, f11 = F
@@ -55,7 +55,7 @@ def actuation_adjoint(F, data, g, signal, tau_bar, signal_bar):
     )
 
 
-@inner_jit
+@jit
 def squeezed(F, s00, s01, s11):
     """S : F^T F, twice the energy density at a signal of 1, of one particle."""
     f00, f01, f10, f11 = F

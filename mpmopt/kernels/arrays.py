@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from mpmopt.kernels.compiler import inner_jit, jit
+from mpmopt.kernels.compiler import jit
 from mpmopt.kernels.simd import nothing, store
 
 # Rows of a state (12, N), or records of a group of particles in it, and the first of each quantity.
@@ -91,13 +91,13 @@ class Tile(NamedTuple):
     gathered: NDArray  # (9 T, 4) by `p2g_adjoint`: A_bar, sums of w q_bar, w m_bar, slopes
 
 
-@inner_jit
+@jit
 def at(g, row):
     """Record of a state that holds a row of group g."""
     return STATE_SIZE * g + row
 
 
-@inner_jit
+@jit
 def components(state, g, row, k):
     """Real parts of the four components of a tensor of particle k of group g."""
     r = at(g, row)
@@ -105,7 +105,7 @@ def components(state, g, row, k):
     return float(c00.real), float(c01.real), float(c10.real), float(c11.real)
 
 
-@inner_jit
+@jit
 def in_tile(t, row):
     """Record of `Tile.gathered` that holds a row of group t of the tile."""
     return GATHERED_SIZE * t + row
@@ -152,7 +152,7 @@ def make_cells(scratch):
     return np.zeros((records, 4), dtype), np.zeros(2 * records, dtype)
 
 
-@inner_jit
+@jit
 def clear(cells, part):
     """Zero the coefficients of a window's cells."""
     zero = nothing(cells)

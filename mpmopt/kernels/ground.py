@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpmopt.kernels.arrays import POSITION, at
-from mpmopt.kernels.compiler import inner_jit, loop_jit
+from mpmopt.kernels.compiler import jit, loop_jit
 from mpmopt.kernels.simd import cell_coordinate, load, real, within
 
 # Columns of a segment: first point, unit vector along it, where it begins and ends as distances
@@ -36,7 +36,7 @@ class Ground(NamedTuple):
     clearance: NDArray[np.float64]  # (M,) how far a node is from the nearest layer
 
 
-@inner_jit
+@jit
 def distance(x, y, ground, k):
     """Signed distance of a place from polyline k, its unit normal, and 1/d at a corner or 0."""
     segments = ground.segments
@@ -65,7 +65,7 @@ def distance(x, y, ground, k):
     return d, rx * bend, ry * bend, bend
 
 
-@inner_jit
+@jit
 def distance_adjoint(nx, ny, bend, d_bar, nx_bar, ny_bar):
     """From d_bar and n_bar to x_bar: d_bar n + bend (I - n n^T) n_bar."""
     across = nx * nx_bar + ny * ny_bar
@@ -75,7 +75,7 @@ def distance_adjoint(nx, ny, bend, d_bar, nx_bar, ny_bar):
     )
 
 
-@inner_jit
+@jit
 def is_clear(state, parameters, g):
     """Whether a group of particles is farther from ground than its layers are thick.
 
@@ -90,7 +90,7 @@ def is_clear(state, parameters, g):
     return clearance > 0.0 and within(rx * rx + ry * ry, -1.0, clearance * clearance)
 
 
-@inner_jit
+@jit
 def deepest(x, y, ground):
     """The polyline that a place is the deepest in, the normal of that, and how far layers are."""
     k, nx, ny, least, clearance = 0, 0.0, 0.0, math.inf, math.inf

@@ -9,7 +9,7 @@ import math
 import numpy as np
 
 from mpmopt.kernels.arrays import MASS_BAR, POSITION, VELOCITY_BAR, at, in_tile
-from mpmopt.kernels.compiler import inner_jit, jit
+from mpmopt.kernels.compiler import jit
 from mpmopt.kernels.ground import (
     NODE_CREEPING,
     NODE_DAMPING,
@@ -25,13 +25,13 @@ from mpmopt.kernels.simd import add_number, number, pack, set_number, total
 from mpmopt.kernels.spline import deposit_value, value_and_slopes
 
 
-@inner_jit
+@jit
 def bearing(d, thickness, capacity):
     """Normal force b = capacity <1 - d/thickness>; capacity is gamma_k V kappa."""
     return capacity * (1.0 - d / thickness) if d.real < thickness else 0.0 * capacity * d
 
 
-@inner_jit
+@jit
 def bearing_adjoint(d, thickness, capacity, b_bar):
     """From b_bar to d_bar and capacity_bar."""
     if d.real < thickness:
@@ -39,7 +39,7 @@ def bearing_adjoint(d, thickness, capacity, b_bar):
     return 0.0 * d, 0.0 * d
 
 
-@inner_jit
+@jit
 def rise(x, y, parameters):
     """How fast layers' forces on solid at a place rise with depth: the sum of kappa / thickness."""
     ground, found = parameters.ground, 0.0
@@ -54,14 +54,14 @@ def rise(x, y, parameters):
     return found
 
 
-@inner_jit
+@jit
 def stored(d, thickness, capacity):
     """Energy of which `bearing` is the force: capacity thickness/2 <1 - d/thickness>^2."""
     short = max(1.0 - d / thickness, 0.0)
     return 0.5 * capacity * thickness * short * short
 
 
-@inner_jit
+@jit
 def friction(v, c, creeping):
     """Tangential velocity v' after a step of Coulomb friction, of c at most: v' + c tau(v') = v.
 
@@ -75,7 +75,7 @@ def friction(v, c, creeping):
     return v * (2.0 * creeping) / (creeping + 2.0 * c + root)
 
 
-@inner_jit
+@jit
 def friction_adjoint(v, c, creeping, v_bar):
     """From v_bar' to v_bar and c_bar."""
     s = v if v > 0.0 else -v
@@ -87,7 +87,7 @@ def friction_adjoint(v, c, creeping, v_bar):
     return v_bar, -sign * x * (2.0 - x) * v_bar
 
 
-@inner_jit
+@jit
 def resistance(u, v, push, contact):
     """Velocity of a node after friction and damping; the layer changes its speed by `push`.
 
@@ -101,7 +101,7 @@ def resistance(u, v, push, contact):
     return nx * normal - ny * along, ny * normal + nx * along
 
 
-@inner_jit
+@jit
 def resistance_adjoint(u, v, push, contact, u_bar, v_bar):
     """From the new velocity's u_bar and v_bar to those of the old one, and push_bar."""
     nx, ny, mu, alpha, creeping = contact
@@ -118,7 +118,7 @@ def resistance_adjoint(u, v, push, contact, u_bar, v_bar):
     return nx * normal_bar - ny * along_bar, ny * normal_bar + nx * along_bar, push_bar
 
 
-@inner_jit
+@jit
 def contact_at(parameters, i, j):
     """Of node (i, j): n_x, n_y, mu, alpha and v_s of the ground there."""
     nodes, k = parameters.ground.nodes, i * parameters.nodes_y + j
@@ -192,7 +192,7 @@ def press_adjoint(state, data, parameters, tile, cells, bar, data_bar, first, la
                         add_number(data_bar.stiffness, g, k, stiffness * volume * capacity_bar)
 
 
-@inner_jit
+@jit
 def store_push(gathered, t, k, px, py, force):
     """The impulse dt b n of a layer on particle k of a group, and b, as numbers of the arrays."""
     set_number(gathered, in_tile(t, VELOCITY_BAR), k, px)
@@ -200,7 +200,7 @@ def store_push(gathered, t, k, px, py, force):
     set_number(gathered, in_tile(t, MASS_BAR), k, force)
 
 
-@inner_jit
+@jit
 def load_push(gathered, t, k):
     """What `store_push` wrote, as what it puts on nodes: (q_x, q_y, 0, f_N)."""
     px = number(gathered, in_tile(t, VELOCITY_BAR), k)

@@ -8,20 +8,20 @@ are numbers of one particle, or records of a group's four. tau derives from Psi:
 
 import numpy as np
 
-from mpmopt.kernels.compiler import inner_jit
+from mpmopt.kernels.compiler import jit
 from mpmopt.kernels.simd import load, product
 
 # Attributes of a scene's material, in the order of `ParticleData.constants`.
 PARAMETERS = ("lame_lambda", "lame_mu", "viscosity")
 
 
-@inner_jit
+@jit
 def solid_constants(data, g):
     """Of the solid that a group's particles are made of."""
     return load(data.constants[0], g), load(data.constants[1], g), load(data.constants[2], g)
 
 
-@inner_jit
+@jit
 def constants_of(data, g):
     """Of a group's particles."""
     lam, mu, eta = solid_constants(data, g)
@@ -29,14 +29,14 @@ def constants_of(data, g):
     return product(stiffness, lam), product(stiffness, mu), product(stiffness, eta)
 
 
-@inner_jit
+@jit
 def constants_of_one(data, g, k):
     """Of particle k of group g, real parts."""
     stiffness, solid = float(data.stiffness[g, k].real), data.constants[:, g, k]
     return stiffness * float(solid[0]), stiffness * float(solid[1]), stiffness * float(solid[2])
 
 
-@inner_jit
+@jit
 def energy_density(F, log_J, constants):
     """Psi = mu/2 (tr F^T F - 2) - mu ln J + lambda/2 ln^2 J, per volume of the reference."""
     lam, mu = constants[:2]
@@ -45,7 +45,7 @@ def energy_density(F, log_J, constants):
     return 0.5 * mu * (trace - 2.0) - mu * log_J + 0.5 * lam * log_J**2
 
 
-@inner_jit
+@jit
 def kirchhoff(F, log_J, constants):
     """Kirchhoff stress tau = mu (F F^T - I) + lambda ln J I: xx, xy, yy."""
     lam, mu = constants[:2]
@@ -57,7 +57,7 @@ def kirchhoff(F, log_J, constants):
     return t00, t01, t11
 
 
-@inner_jit
+@jit
 def kirchhoff_adjoint(F, log_J, constants, tau_bar):
     """F_bar = (T + T^T) F mu + lambda tr T F^-T with T = tau_bar; its xy counts xy and yx."""
     lam, mu = constants[:2]
@@ -72,7 +72,7 @@ def kirchhoff_adjoint(F, log_J, constants, tau_bar):
     )
 
 
-@inner_jit
+@jit
 def wave_modulus(trace, apart, constants):
     """Stiffness M against plane waves of a particle as stretched as it is, of one number each.
 

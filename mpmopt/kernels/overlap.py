@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpmopt.kernels.arrays import DEFORMATION, POSITION, at, components
-from mpmopt.kernels.compiler import inner_loop_jit, loop_jit
+from mpmopt.kernels.compiler import loop_jit
 
 # Parts nearer than so many cells in the reference configuration are one part.
 FAR = 4.0
@@ -70,7 +70,7 @@ def closest(
     return math.sqrt(least), x_least, y_least
 
 
-@inner_loop_jit
+@loop_jit
 def _area(state, data, g, k):
     """The current area of a particle."""
     f00, f01, f10, f11 = components(state, g, DEFORMATION, k)

@@ -3,7 +3,7 @@
 import numpy as np
 
 from mpmopt.kernels.arrays import COEFFICIENTS, PLACE_SIZE, POSITION, at
-from mpmopt.kernels.compiler import inner_jit, jit
+from mpmopt.kernels.compiler import jit
 from mpmopt.kernels.simd import (
     add,
     cell_coordinate,
@@ -92,7 +92,7 @@ def taylor_adjoint(cells, part, nodes):
         store(nodes, node + rows + 1, after)
 
 
-@inner_jit
+@jit
 def store_place(tile, g, t, h, r, axis):
     """Where particles of group g are in their cells along an axis: t, t^2/2 and 3t/8 - t^3/2."""
     store(tile.place, PLACE_SIZE * g + axis, t)
@@ -100,7 +100,7 @@ def store_place(tile, g, t, h, r, axis):
     store(tile.place, PLACE_SIZE * g + 4 + axis, r)
 
 
-@inner_jit
+@jit
 def place_along_x(tile, g, k):
     """What `store_place` wrote along x, of particle k of a group."""
     return (
@@ -110,7 +110,7 @@ def place_along_x(tile, g, k):
     )
 
 
-@inner_jit
+@jit
 def place_along_y(tile, g, k):
     """What `store_place` wrote along y, of particle k of a group."""
     return (
@@ -120,7 +120,7 @@ def place_along_y(tile, g, k):
     )
 
 
-@inner_jit
+@jit
 def deposit(cells, tile, g, k, f, a, b):
     """Add the moments of w f + w r_x a + w r_y b to the cell of particle k of a group."""
     c = COEFFICIENTS * int(number(tile.cell, g, k))
@@ -130,7 +130,7 @@ def deposit(cells, tile, g, k, f, a, b):
     deposit_row(cells, c + 6, tile, g, k, hx * f + rx * a, hx * b)
 
 
-@inner_jit
+@jit
 def deposit_row(cells, c, tile, g, k, f, b):
     """The moments along y of w f + w r_y b."""
     ty, hy, ry = place_along_y(tile, g, k)
@@ -139,7 +139,7 @@ def deposit_row(cells, c, tile, g, k, f, b):
     add(cells, c + 2, hy * f + ry * b)
 
 
-@inner_jit
+@jit
 def moments(cells, tile, g, k):
     """Sums over the nodes of particle k of a group of w f, w r_x f and w r_y f, for r in cells."""
     c = COEFFICIENTS * int(number(tile.cell, g, k))
@@ -150,7 +150,7 @@ def moments(cells, tile, g, k):
     return f0 + tx * f1 + hx * f2, 0.25 * f1 + rx * f2, b0 + tx * b1 + hx * b2
 
 
-@inner_jit
+@jit
 def moments_row(cells, c, tile, g, k):
     """Along y only: w f and w r_y f."""
     ty, hy, ry = place_along_y(tile, g, k)
@@ -158,7 +158,7 @@ def moments_row(cells, c, tile, g, k):
     return f0 + ty * f1 + hy * f2, 0.25 * f1 + ry * f2
 
 
-@inner_jit
+@jit
 def slopes(cells, tile, g, k, f, a, b):
     """Derivatives along x and y, per cell, of f.sum(w F) + a.sum(w r_x F) + b.sum(w r_y F).
 
@@ -177,7 +177,7 @@ def slopes(cells, tile, g, k, f, a, b):
     return along_x, along_y
 
 
-@inner_jit
+@jit
 def slopes_row(cells, c, tile, g, k):
     """Along y only: w f, w r_y f, and of the former slope and curvature."""
     ty, _, _ = place_along_y(tile, g, k)
@@ -186,7 +186,7 @@ def slopes_row(cells, c, tile, g, k):
     return f, b, load(cells, c + 1) + ty * curvature, curvature
 
 
-@inner_jit
+@jit
 def deposit_value(cells, tile, g, k, f):
     """Add the moments of w f alone, as `deposit` does with a = b = 0."""
     c = COEFFICIENTS * int(number(tile.cell, g, k))
@@ -204,7 +204,7 @@ def deposit_value(cells, tile, g, k, f):
     add(cells, c + 8, hy * hf)
 
 
-@inner_jit
+@jit
 def value_and_slopes(cells, tile, g, k):
     """The cells' field at particle k of a group, and its derivatives along x and y, per cell."""
     c = COEFFICIENTS * int(number(tile.cell, g, k))

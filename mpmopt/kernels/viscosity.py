@@ -7,13 +7,13 @@ from the particle's affine velocity C, which is as old as the velocities, and th
 
 import numpy as np
 
-from mpmopt.kernels.compiler import inner_jit
+from mpmopt.kernels.compiler import jit
 from mpmopt.kernels.material import PARAMETERS
 
 VISCOSITY = PARAMETERS.index("viscosity")
 
 
-@inner_jit
+@jit
 def strains(F, C):
     """B = F F^T and D = sym C: xx, xy, yy."""
     f00, f01, f10, f11 = F
@@ -22,7 +22,7 @@ def strains(F, C):
     return B, (c00, 0.5 * (c01 + c10), c11)
 
 
-@inner_jit
+@jit
 def between(B, X):
     """B X B of symmetric tensors: xx, xy, yy."""
     b00, b01, b11 = B
@@ -32,7 +32,7 @@ def between(B, X):
     return m00 * b00 + m01 * b01, m00 * b01 + m01 * b11, m10 * b01 + m11 * b11
 
 
-@inner_jit
+@jit
 def add_viscosity(F, C, constants, tau):
     """tau + eta B D B: xx, xy, yy."""
     eta = constants[VISCOSITY]
@@ -42,7 +42,7 @@ def add_viscosity(F, C, constants, tau):
     return t00 + eta * v00, t01 + eta * v01, t11 + eta * v11
 
 
-@inner_jit
+@jit
 def viscous_modulus(trace, apart, constants):
     """Largest ratio of B D B eta to D, of a particle as stretched as it is, of one number each.
 
@@ -52,7 +52,7 @@ def viscous_modulus(trace, apart, constants):
     return constants[VISCOSITY] * b * b
 
 
-@inner_jit
+@jit
 def viscosity_adjoint(F, C, constants, tau_bar):
     """C_bar = eta B T B, and F_bar = 2 eta (T B D + D B T) F with T = sym tau_bar.
 
