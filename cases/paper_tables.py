@@ -43,7 +43,8 @@ def row(name: str, source: str, summary: Mapping[str, Any]) -> dict[str, str]:
     optimised, solid = values["optimised"], values["post_processed"]
     if solid is not None:
         values["gain"] = solid - values["reference"]
-        values["kept"] = values["gain"] / (optimised - values["reference"])
+        if optimised > values["reference"]:  # else there is no gain to keep
+            values["kept"] = values["gain"] / (optimised - values["reference"])
     line = {"case": name, "source": source}
     for column in ("reference", "optimised", "post_processed", "gain", "a", "theta", "b"):
         line[column] = "-" if values.get(column) is None else f"{values[column]:.3f}"
