@@ -30,6 +30,7 @@ from mpmopt.optimisation.settings import Settings, Stage
 from mpmopt.results import runfile
 from mpmopt.scene import Grid, Ground, Solid
 from mpmopt.view import film as films
+from mpmopt.view import plot
 from mpmopt.view.film import LAST, RATE, Screen, _mp4, film, playing_time
 
 ROOT = Path(__file__).parent.parent
@@ -320,6 +321,27 @@ def test_the_command_says_what_it_made(short_path, tmp_path, capsys):
     assert "10 of 10 frames" in printed.err
     assert main(["film", str(short_path), "--out", str(tmp_path / "film.avi")]) == 1
     assert capsys.readouterr().err.startswith("DesignError: ")
+
+
+def test_bodies_that_cannot_be_simulated_are_left_out_of_film_and_picture(
+    short_run, tmp_path, caplog, monkeypatch
+):
+    """Measured: with void, and in the task's middle scene alone, a walker's preview failed."""
+
+    def fails(problem, x):
+        raise SimulationError("it burst", 3, -1, (np.nan, np.nan), "take another")
+
+    for module in (films, plot):
+        monkeypatch.setattr(module, "optimised", fails)
+    film(tmp_path / "a.gif", short_run, 0.2)
+    plot.PICTURES["design"](tmp_path / "design.png", short_run)
+    assert {path.name for path in tmp_path.iterdir()} == {"a.gif", "design.png"}
+    assert "the film is without a body: step 3, body: it burst" in caplog.text
+    assert "the picture is of the design without grey: step 3" in caplog.text
+    for name in ("post_processed", "reference"):
+        monkeypatch.setattr(films, name, fails)
+    with pytest.raises(SimulationError, match="it burst"):
+        film(tmp_path / "b.gif", short_run, 0.2)
 
 
 def test_a_run_without_a_design_has_no_film(tmp_path):

@@ -209,8 +209,7 @@ def film(
 ) -> Filmed:
     """Write a film of a run's best design, the same without grey, and the solid reference design.
 
-    All have the best design's actuation. A body that cannot be simulated is left out, but for the
-    best design itself.
+    All have the best design's actuation. A body that cannot be simulated is left out.
 
     Or of the finished robot alone, in the time that its speed is of (`robustness.speed`).
 
@@ -295,16 +294,18 @@ def film(
 def _beside(
     problem: Problem, x: NDArray[np.float64], instants: NDArray[np.int64]
 ) -> tuple[list[Body], list[Motion]]:
-    """The best design, and others that can be simulated, with their motions."""
-    bodies = [optimised(problem, x)]
-    motions = [Motion.of(bodies[0], instants)]
-    for make in (post_processed, reference):
+    """The best design, the same without grey and the reference, if they can be simulated."""
+    bodies, motions, failures = [], [], []
+    for make in (optimised, post_processed, reference):
         try:
             body = make(problem, x)
             motions.append(Motion.of(body, instants))
             bodies.append(body)
         except SimulationError as error:
             logger.warning("the film is without a body: %s", error)
+            failures.append(error)
+    if not bodies:
+        raise failures[0]
     return bodies, motions
 
 

@@ -151,6 +151,16 @@ def overview(run: Optimisation) -> Figure:
     return figure
 
 
+def _plot_design(path: Path, run: Optimisation) -> None:
+    """The best design, or where its void fails, the same without grey."""
+    problem, x = run.problem(), run.result.x
+    try:
+        plot_motion(path, optimised(problem, x))
+    except SimulationError as error:
+        logger.warning("the picture is of the design without grey: %s", error)
+        plot_motion(path, post_processed(problem, x))
+
+
 def _robot(run: Optimisation) -> Robot:
     return Robot.of(run.problem(), run.result.x)
 
@@ -158,7 +168,7 @@ def _robot(run: Optimisation) -> Robot:
 PICTURES: dict[str, Callable[[Path, Optimisation], None]] = {
     "schematic": lambda path, run: replace_file(path, png(schematic(run.scene))),
     "history": lambda path, run: plot_history(path, run),
-    "design": lambda path, run: plot_motion(path, optimised(run.problem(), run.result.x)),
+    "design": lambda path, run: _plot_design(path, run),
     "post_processed": lambda path, run: plot_motion(
         path, post_processed(run.problem(), run.result.x)
     ),
