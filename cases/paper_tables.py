@@ -40,15 +40,15 @@ def row(name: str, source: str, summary: Mapping[str, Any]) -> dict[str, str]:
     values = dict(summary)
     references = [summary["reference"], summary.get("baseline")]
     values["reference"] = max(value for value in references if value is not None)
-    optimised, solid = values["optimised"], values["post_processed"]
+    optimised, solid, share = values["optimised"], values["post_processed"], "-"
     if solid is not None:
         values["gain"] = solid - values["reference"]
-        if optimised > values["reference"]:  # else there is no gain to keep
-            values["kept"] = values["gain"] / (optimised - values["reference"])
+        if optimised > values["reference"]:  # else there is no gain to retain
+            share = f"{values['gain'] / (optimised - values['reference']):.0%}"
     line = {"case": name, "source": source}
     for column in ("reference", "optimised", "post_processed", "gain", "a", "theta", "b"):
         line[column] = "-" if values.get(column) is None else f"{values[column]:.3f}"
-    line["share of gain retained"] = f"{values['kept']:.0%}" if "kept" in values else "-"
+    line["share of gain retained"] = share
     return line
 
 
