@@ -196,6 +196,6 @@ class Motion:
         return np.array([seen.min(axis=(0, 2)), seen.max(axis=(0, 2))], dtype=float)
 
 
-def equal_steps(scene: Scene, count: int) -> NDArray[np.int64]:
-    """Numbers of steps (count,) at equal intervals from start to end."""
-    return np.rint(np.linspace(0, scene.steps, count)).astype(np.int64)
+def equal_steps(scene: Scene, count: int, first: int = 0) -> NDArray[np.int64]:
+    """Numbers of steps (count,) at equal intervals from the first to the end."""
+    return np.rint(np.linspace(first, scene.steps, count)).astype(np.int64)

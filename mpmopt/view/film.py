@@ -19,7 +19,7 @@ from PIL import Image
 
 from mpmopt.assess.forces import Books, books
 from mpmopt.assess.robustness import SEEN, SETTLED, Robot, can_be_studied, lasting, unit
-from mpmopt.assess.trajectory import Body, Motion, optimised, post_processed, reference
+from mpmopt.assess.trajectory import Body, Motion, equal_steps, optimised, post_processed, reference
 from mpmopt.design.problem import Problem
 from mpmopt.errors import DesignError, MissingLibraryError, SimulationError, StorageError
 from mpmopt.io.files import replace_file
@@ -259,8 +259,7 @@ def film(
     count = round(seconds * RATE) if 0.0 < seconds <= 600.0 else 0
     if count < 2:
         raise DesignError(f"film: seconds = {seconds!r} must be from {2 / RATE:g} to 600")
-    first = round(begin / scene.time_step)
-    instants = np.rint(np.linspace(first, scene.steps, count)).astype(np.int64)
+    instants = equal_steps(scene, count, round(begin / scene.time_step))
     if finished:
         bodies = [body_of(Robot.of(problem, x), scene)]
         motions = [Motion.of(bodies[0], instants)]

@@ -168,7 +168,7 @@ def _robot(run: Optimisation) -> Robot:
 PICTURES: dict[str, Callable[[Path, Optimisation], None]] = {
     "schematic": lambda path, run: replace_file(path, png(schematic(run.scene))),
     "history": lambda path, run: plot_history(path, run),
-    "design": lambda path, run: _plot_design(path, run),
+    "design": _plot_design,
     "post_processed": lambda path, run: plot_motion(
         path, post_processed(run.problem(), run.result.x)
     ),
