@@ -76,10 +76,9 @@ def with_shorter_steps(
     """
     first: SceneError | SimulationError | None = None
     for halved in range(halvings + 1):
-        part = 2**halved
-        shorter = replace(scene, time_step=scene.time_step / part, steps=part * scene.steps)
         try:
-            return simulated(shorter if halved else scene), halved
+            there = scene.vary(time_step=scene.time_step / 2**halved) if halved else scene
+            return simulated(there), halved
         except (SceneError, SimulationError) as error:
             first = first or error
             if isinstance(error, (SceneError, FractureError, OverlapError)):
