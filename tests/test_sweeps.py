@@ -308,10 +308,11 @@ def test_no_address_means_processes_and_a_wrong_one_is_an_error():
 
 
 CLIENT = """
-import functools, sys
+import functools, signal, sys
 from pathlib import Path
 from mpmopt.app.sweeps import connected, sweep
 from swept import held_square
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a script in the background ignores it
 store, log, go, scheduler = sys.argv[1:]
 with connected(scheduler or None) as executor:
     function = functools.partial(held_square, log=log, go=go)
@@ -351,6 +352,7 @@ def end_a_client(number, store, log, go, scheduler):
     finally:
         client.kill()
         client.wait()
+        client.stderr.close()
         go.touch()  # a cluster is still at it
     assert client.returncode == -number
     if number == signal.SIGINT:
