@@ -357,5 +357,5 @@ def test_an_interrupt_ends_a_long_film_at_once(short_path, tmp_path):
     process.send_signal(signal.SIGINT)
     _, said = process.communicate(timeout=30)
     assert process.returncode == 130
-    assert said.splitlines()[-1] == "stopped by SIGINT."
+    assert said.splitlines()[-1] == "stopped by SIGINT. Files are complete or absent."
     assert not list(tmp_path.iterdir())
