@@ -66,6 +66,17 @@ def test_the_finer_robot_has_the_same_shape():
         assert areas[0] == pytest.approx(areas[1])
 
 
+@pytest.mark.parametrize("formulation", ["updated", "total"])
+def test_finer_cells_of_a_viscous_body_take_a_shorter_step(formulation):
+    """Viscosity bounds the step by the square of the width: a climber on 96 cells had no study."""
+    scene = dataclasses.replace(climber(64, 1e-3, 4.0), formulation=formulation)
+    step = scene.largest_time_step / 1.05
+    scene = dataclasses.replace(scene, time_step=step, steps=10, transient=0.0)
+    fine = refined(scene, 4)
+    assert 0.5 < fine.time_step / fine.largest_time_step <= 1.0 < step / 4 / fine.largest_time_step
+    assert fine.duration == pytest.approx(scene.duration, rel=1e-12)
+
+
 def test_a_step_over_the_stability_limit_is_left_out():
     scene = small_scene()
     for share in (0.45, 0.9):
