@@ -204,8 +204,9 @@ class Optimisation:
         """The best evaluation.
 
         That is the one that counts most (`Candidate.counted`), where stages ask for bodies without
-        void, and of refined stages where there are some; else the best of the last stage that had
-        one, whose projection is the sharpest. Those that meet the constraints come first.
+        void, and of refined and of finer stages where there are some; else the best of the last
+        stage that had one, whose projection is the sharpest. Those that meet the constraints come
+        first.
 
         Raises
         ------
@@ -217,9 +218,10 @@ class Optimisation:
             raise DesignError(f"there is no design: no evaluation succeeded yet{last}")
         stages = self.settings.stages
 
-        def merit(item: Candidate) -> tuple[float, bool, float, int]:
-            refined = stages[item.stage].refined and np.isfinite(item.counted)
-            return -item.violation, bool(refined), item.counted, item.stage
+        def merit(item: Candidate) -> tuple[float, int, float, int]:
+            stage = stages[item.stage]
+            finer = 2 * bool(stage.finer) + stage.refined if np.isfinite(item.counted) else 0
+            return -item.violation, finer, item.counted, item.stage
 
         return max(self.best.values(), key=merit)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,6 +60,17 @@ def gait(most_iterations: int, move_limit: float = 0.02) -> Settings:
         tolerance=0.0,
         most_iterations=most_iterations,
     )
+
+
+def then_finer(settings: Settings, scenes: tuple[int, ...], most_iterations: int) -> Settings:
+    """The same, and a stage like its last one in which some of the task's scenes are finer.
+
+    For robots that lose speed on finer cells: from a finished one it mends that, from the start it
+    finds slower ones. Designs are not refined once more there.
+    """
+    *_, last = settings.stages
+    late = replace(last, refined=False, finer=scenes, most_iterations=most_iterations)
+    return replace(settings, stages=(*settings.stages, late))
 
 
 def paper_preset(time_step: float) -> Settings:

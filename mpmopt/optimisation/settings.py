@@ -53,6 +53,9 @@ class Stage(Checked):
         Whether such a design counts with the least of this and of the same with half the step and
         with cells half as wide (`refinement.least`), so that the best is one that keeps its gain.
         This costs four gradients more for each design that goes farther than the best so far.
+    finer : tuple of int
+        Numbers, from 0, of the task's scenes that have cells half as wide in this stage: a late
+        stage with one teaches a robot to go on any.
     move_limit : float
         Greatest step of a variable, as a fraction of its range.
     void_cutoff : float
@@ -80,6 +83,7 @@ class Stage(Checked):
     time_step: float | None = None
     solid: bool = False
     refined: bool = False
+    finer: tuple[int, ...] = ()
     move_limit: float = 0.05
     void_cutoff: float = 0.0
     most_iterations: int | None = None
@@ -97,6 +101,10 @@ class Stage(Checked):
         _take(self, flag, "solid refined limited subpixel")
         if self.refined and not self.solid:
             raise DesignError("Stage: refined = True needs solid = True")
+        given: Any = self.finer
+        numbers = tuple(given) if isinstance(given, Iterable) else (given,)
+        finer = tuple(count("Stage", "finer", k, 0, error=DesignError) for k in numbers)
+        object.__setattr__(self, "finer", finer)
         _take(self, count, "most_iterations", least=1)
         _take(self, count, "halvings", least=0)
 
@@ -108,6 +116,23 @@ class Stage(Checked):
             void_density=density if self.void_density is None else self.void_density,
             void_stiffness=stiffness if self.void_stiffness is None else self.void_stiffness,
         )
+
+    def task(self, task: Task) -> Task:
+        """The task as this stage solves it: with some of its scenes `finer`.
+
+        Raises
+        ------
+        DesignError
+            If it has no scene of such a number.
+        """
+        scenes = list(task.scenes)
+        for k in self.finer:
+            if k >= len(scenes):
+                raise DesignError(
+                    f"Stage: finer = {self.finer} names scene {k}, the task has {len(scenes)}"
+                )
+            scenes[k] = dataclasses.replace(scenes[k], refinement=2 * scenes[k].refinement)
+        return dataclasses.replace(task, scenes=tuple(scenes))
 
     def problem(
         self,
@@ -125,7 +150,7 @@ class Stage(Checked):
             self.void_cutoff,
             self.halvings,
             LIMITS if self.limited else None,
-            task=task,
+            task=self.task(task),
             subpixel=self.subpixel,
         )
 
