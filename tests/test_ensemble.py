@@ -225,9 +225,8 @@ def test_a_late_stage_has_finer_cells_and_the_robot_is_of_it(x, tmp_path):
 
 
 def test_finer_scenes_are_scenes_of_the_task():
-    settings = Settings(Stage(2.0, finer=(3,)))
+    settings = Settings((Stage(2.0, finer=(3,)),))
     with pytest.raises(DesignError, match=r"finer = \(3,\) names scene 3, the task has 3"):
         begin(SCENE, settings, {}, TASK)
     with pytest.raises(DesignError, match="finer = -1"):
         Stage(2.0, finer=(-1,))
-    assert Stage(2.0, finer=1) == Stage(2.0, finer=[1])

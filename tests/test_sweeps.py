@@ -345,6 +345,7 @@ def end_a_client(number, store, log, go, scheduler):
         env={**os.environ, "PYTHONPATH": path}, stderr=subprocess.PIPE, text=True,
         start_new_session=True,
     )  # fmt: skip
+    assert client.stderr is not None
     try:
         until(lambda: len(noted(log)) >= 5 and len(read(store)) >= 3)  # two are under way
         os.killpg(client.pid, number) if number == signal.SIGINT else client.kill()
