@@ -62,6 +62,7 @@ def test_a_stage_names_what_differs_from_the_scene_and_its_formulation(formulati
     other = Stage(2.0, void_stiffness=5e-4, time_step=1e-3).scene(scene)
     assert (other.time_step, other.material.void_density) == (1e-3, floors[0])
     assert other.material.void_stiffness == 5e-4
+    assert Stage(2.0, void_density=5e-3).scene(scene).material.void_density == 5e-3
 
 
 def test_a_scene_alone_can_be_optimised():
