@@ -15,7 +15,7 @@ from mpmopt.app.script import main
 from mpmopt.design.task import Task
 from mpmopt.design.variables import Bounded, Tied
 from mpmopt.design.variation import Variation
-from mpmopt.optimisation.presets import IN_ONE_PIECE, black_and_white, gait
+from mpmopt.optimisation.presets import IN_ONE_PIECE, black_and_white, gait, then_finer
 from mpmopt.scene import Actuator, Design, Grid, Ground, Material, Mirror, Scene
 
 
@@ -91,7 +91,9 @@ TASK = Task(
 )
 
 CASES = {
-    "default": Case(climber(64, 1e-3, 4.0), gait(100, 0.005), three_pairs, START, TASK),
+    "default": Case(
+        climber(64, 1e-3, 4.0), then_finer(gait(100, 0.005), (1,), 25), three_pairs, START, TASK
+    ),
     "preview": Case(climber(64, 1e-3, 3.0), gait(40, 0.005), three_pairs, START, TASK),
 }
 
