@@ -296,7 +296,7 @@ def test_no_share_of_a_robot_that_stays_where_it_is(told):
         found = study_of(on_ground())
         assert found["speed"] == nominal
         if nominal is not None:
-            back = found["failures"]["shares"].startswith(robustness.GOES_BACK)
+            back = found["failures"]["shares"].startswith("the robot goes back")
             assert back is (nominal < 0.0)
         assert {*found["kept"].values(), found["driven_share"], found["after_push"]} == {None}
 

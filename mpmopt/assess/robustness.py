@@ -64,7 +64,6 @@ TRIALS = {
     "half_step": "step 0.5", "finer_cells": "cells 2", "finest_cells": "cells 4",
     "other_formulation": "other 2",
 }  # fmt: skip
-GOES_BACK = "the robot goes back"  # why it has no shares
 TOO_LONG = "particles times steps are more than"  # why a run was left out
 # Particles times steps of one run, in the short study and in the full: longer ones are left out.
 MOST_WORK, MOST_WORK_FULL = 1.5e8, 5e9
@@ -412,7 +411,7 @@ def study(
 
     least = LEAST * max(scene.extent)
     if nominal is not None and not nominal > least:
-        why = GOES_BACK if nominal < -least else "the robot stands"
+        why = "the robot goes back" if nominal < 0.0 else "the robot stands"
         failures["shares"] = f"{why}: a speed of less than {least:.2g} has no shares"
 
     def share(name: str) -> float | None:
