@@ -390,9 +390,9 @@ def study(
         full a quarter as wide, and half as wide in the other formulation; ``driven_share``, what is
         missing when the actuation is held; ``after_push``, the share of the speed that it has after
         a push; ``followed``, how long it goes on and what ends it; ``components``, before loose
-        pieces are dropped; ``failures``, why a number is None; and ``shorter_steps``, if there are
-        any, the steps of runs with other cells or in the other formulation that fail with the step
-        that they should have. Only the components where there is no ground or no actuator.
+        pieces are dropped; ``failures``, why a number is None; and ``shorter_steps_of_speed``,
+        the steps of runs with other cells or in the other formulation that fail with the step that
+        they should have. Only the components where there is no ground or no actuator.
 
     Raises
     ------
@@ -451,7 +451,7 @@ def study(
             },
             "followed": vars(follow(robot, scene)),
         }
-    return found | {"failures": failures} | ({"shorter_steps": shorter} if shorter else {})
+    return found | {"failures": failures, "shorter_steps_of_speed": shorter}
 
 
 def _trials(scene: Scene, full: bool) -> dict[str, Trial]:
