@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_rgb
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -28,6 +29,7 @@ from mpmopt.optimisation.history import Optimisation
 from mpmopt.scene import Scene
 from mpmopt.view.draw import (
     BLUE,
+    LAYER,
     RED,
     Arrows,
     Forces,
@@ -309,8 +311,8 @@ def _beside(
 
 
 def palette() -> Image.Image:
-    """The colours that films have: greys, and red and blue from black over themselves to white."""
-    colours = [np.repeat(np.linspace(0.0, 1.0, 32)[:, None], 3, axis=1)]
+    """Those of films: greys, red and blue from black over themselves to white, and the layer's."""
+    colours = [np.repeat(np.linspace(0.0, 1.0, 32)[:, None], 3, axis=1), np.array([to_rgb(LAYER)])]
     for tint in (np.array(RED), np.array(BLUE)):
         share = np.linspace(0.0, 1.0, 17)[1:, None]
         colours += [share * tint, share[:-1] + (1.0 - share[:-1]) * tint]

@@ -183,6 +183,7 @@ def _film(body: Body, most: int) -> dict[str, Any]:
         "signal": signal_of.ravel(),
         "motion": packed(motion, box, order),
         "solids": _solids(scene, box, motion.spacing),
+        "layers": [layer.thickness for layer in scene.layers],
         "travel": travel,
         "rise": rise,
         "feet": [
@@ -220,7 +221,7 @@ def packed(motion: Motion, box: NDArray[np.float64], order: NDArray[np.int64]) -
 
 
 def _solids(scene: Scene, box: NDArray[np.float64], spacing: float) -> list[NDArray[np.float64]]:
-    """Corners of all that is rigid, as far as it is within a box."""
+    """Corners of all that is rigid, the ground first, as far as it is within a box."""
     (left, low), (right, high) = box
     reach = 4.0 * float(np.ptp(box, axis=0).sum())
     solids = [ground_outline(ground, reach) for ground in scene.ground]
