@@ -148,12 +148,12 @@ def test_a_run_of_another_case_is_never_overwritten(folder):
 
 @pytest.mark.parametrize("how", ["the picture fails", "matplotlib cannot be imported"])
 def test_a_picture_that_fails_spoils_no_run(tmp_path, caplog, monkeypatch, how):
-    def fails(path, body):
+    def fails(path, motion):
         raise RuntimeError("latex was not able to process the string\nwith a log\nof many lines")
 
     with monkeypatch.context() as patch:
         if how == "the picture fails":
-            patch.setattr(plot, "plot_motion", fails)
+            patch.setattr(plot, "_plot_motion", fails)
         else:
             patch.setitem(sys.modules, "mpmopt.view.plot", None)
         summary = run(TINY, tmp_path)

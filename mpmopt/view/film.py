@@ -20,9 +20,15 @@ from PIL import Image
 
 from mpmopt.assess.forces import Books, books
 from mpmopt.assess.robustness import SEEN, SETTLED, Robot, can_be_studied, lasting, unit
-from mpmopt.assess.trajectory import Body, Motion, equal_steps, optimised, post_processed, reference
-from mpmopt.design.problem import Problem
-from mpmopt.errors import DesignError, MissingLibraryError, SimulationError, StorageError
+from mpmopt.assess.trajectory import (
+    Motion,
+    equal_steps,
+    moving,
+    optimised,
+    post_processed,
+    reference,
+)
+from mpmopt.errors import DesignError, MissingLibraryError, StorageError
 from mpmopt.io.files import replace_file
 from mpmopt.io.progress import Progress
 from mpmopt.optimisation.history import Optimisation
@@ -261,12 +267,16 @@ def film(
     count = round(seconds * RATE) if 0.0 < seconds <= 600.0 else 0
     if count < 2:
         raise DesignError(f"film: seconds = {seconds!r} must be from {2 / RATE:g} to 600")
-    instants = equal_steps(scene, count, round(begin / scene.time_step))
+
+    def frames_of(scene: Scene) -> NDArray[np.int64]:
+        return equal_steps(scene, count, round(begin / scene.time_step))
+
     if finished:
         bodies = [body_of(Robot.of(problem, x), scene)]
-        motions = [Motion.of(bodies[0], instants)]
+        motions = [Motion.of(bodies[0], frames_of(scene))]
     else:
-        bodies, motions = _beside(problem, x, instants)
+        makes = optimised, post_processed, reference
+        bodies, motions = map(list, zip(*moving(problem, x, makes, frames_of)))
     slow = seconds / duration
     screen = Screen(motions, slow, [books(body.simulation) for body in bodies] if forces else ())
     with Progress("frames", screen.frames) as progress:
@@ -290,24 +300,6 @@ def film(
         one = unit(problem.scene)
         spans += f"; the speed is that of {SETTLED * one:g} to {SEEN * one:g} (film --finished)"
     return Filmed(count, seconds + LAST, slow, per_period, len(content), spans)
-
-
-def _beside(
-    problem: Problem, x: NDArray[np.float64], instants: NDArray[np.int64]
-) -> tuple[list[Body], list[Motion]]:
-    """The best design, the same without grey and the reference, if they can be simulated."""
-    bodies, motions, failures = [], [], []
-    for make in (optimised, post_processed, reference):
-        try:
-            body = make(problem, x)
-            motions.append(Motion.of(body, instants))
-            bodies.append(body)
-        except SimulationError as error:
-            logger.warning("the film is without a body: %s", error)
-            failures.append(error)
-    if not bodies:
-        raise failures[0]
-    return bodies, motions
 
 
 def palette() -> Image.Image:
