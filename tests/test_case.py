@@ -30,6 +30,7 @@ from mpmopt.errors import DesignError, RunFileError, StorageError
 from mpmopt.optimisation.loop import optimise
 from mpmopt.optimisation.settings import Settings, Stage
 from mpmopt.results import runfile
+from mpmopt.validation import digits
 from mpmopt.view import plot
 from mpmopt.view.live import ProgressBar, most_evaluations
 
@@ -279,6 +280,15 @@ def test_progress_tells_the_best_that_meets_all_constraints_in_a_short_line(boun
     if found.groups():
         values = [i.objective for i in run.history if not i.violation]
         assert float(found[2]) == pytest.approx(max(values) - run.origin, rel=1e-2)
+
+
+def test_progress_counts_what_was_before_and_tells_displacements(short_run, capsys):
+    first = short_run.history[0]
+    begun = dataclasses.replace(short_run, stop_reason="", stage=0, history=[first] * 10)
+    ProgressBar()(begun)  # of a run that is gone on with
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"10 of {most_evaluations(begun)} evaluations, ")
+    assert f"displacement {digits(first.objective - begun.origin, 3)}, best " in line
 
 
 def test_the_number_of_evaluations_is_known_from_the_stages(short_run):
