@@ -301,6 +301,8 @@ def test_the_number_of_evaluations_is_known_from_the_stages(short_run):
     assert most_evaluations(begun) == 2 + 19 + 20 + 7  # what failed is done again
     early = dataclasses.replace(begun, stage=1, history=[first] * 9)
     assert most_evaluations(early) == 9 + 20 + 7
+    over = dataclasses.replace(begun, history=[first] * 25)  # five too many
+    assert most_evaluations(over) == 25 + 20 + 7
 
 
 def test_the_walkers_settings_are_those_of_the_design():
