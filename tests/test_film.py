@@ -264,6 +264,7 @@ def test_a_body_that_needs_a_shorter_step_moves_in_half_of_it(short_run):
     (_, whole), (body, half) = moving(problem, x, makes, lambda scene: equal_steps(scene, 5))
     assert body.simulation.scene.time_step == half.scene.time_step == step / 2.0
     assert half.frames * half.scene.time_step == pytest.approx(whole.frames * step, abs=step)
+    assert half.frames[-1] == half.scene.steps == 2 * problem.scene.steps
     assert half.objective[-1] == pytest.approx(whole.objective[-1], rel=1e-2)
 
 

@@ -88,6 +88,8 @@ WRONG: Any = ((1.0, 2.0), "left")  # of types that mypy refuses
         (lambda: Design((0.2, 0.2), (0.1, 0.3)), ["0.2", "0.1"]),
         (lambda: Actuator((0, 0), (1, 1), stress=((1.0, 2.0), (3.0, 1.0))), ["2.0", "3.0"]),
         (lambda: Actuator((0, 0), (1, 1), stress=WRONG[0]), ["2 entries"]),
+        (lambda: Solid((1, 0), (1, 2)), ["(1.0, 0.0)", "left of and below", "(1.0, 2.0)"]),
+        (lambda: Solid((0, 2), (1, 2)), ["(0.0, 2.0)", "left of and below", "(1.0, 2.0)"]),
         (lambda: Wall("y", 0.1, friction=-0.5), ["-0.5"]),
         (lambda: Wall("y", 0.1, solid_side=WRONG[1]), ["left"]),
         (lambda: small_scene(direction=(1.0, 1.0)), ["1.41421356", "length 1"]),
