@@ -310,6 +310,8 @@ def test_a_robot_on_walls_has_no_study():
     [
         ("goes on", lambda t: 0.1 * t, lambda t: 1.0 + 0 * t, lambda t: 0.2 * np.sin(t)),
         ("goes on", lambda t: 0.1 * t, lambda t: np.where(t < 0.5, 3.0, 1.0), lambda t: 0 * t),
+        ("goes on", lambda t: 0.1 * (t - np.clip(t - 9, 0, 1.5)), np.ones_like, np.zeros_like),
+        ("goes on", lambda t: 0.1 * np.maximum(t - 1.9, 0.0), np.ones_like, np.zeros_like),
         ("falls", lambda t: 0.1 * t, lambda t: np.where(t < 6.0, 1.0, 0.4), lambda t: 0 * t),
         ("falls", lambda t: 0.1 * t, lambda t: 1.0 + 0 * t, lambda t: np.where(t < 6.0, 0.0, -0.8)),
         ("stops", lambda t: 0.1 * np.minimum(t, 6.0), lambda t: 1.0 + 0 * t, lambda t: 0 * t),
