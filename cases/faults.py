@@ -45,7 +45,7 @@ from mpmopt.io.files import replace_file
 from mpmopt.optimisation.settings import Settings, Stage
 from mpmopt.results import runfile
 from mpmopt.scene import Actuator, Design, Grid, Ground, Material, Scene, Solid
-from mpmopt.simulation import buffers, simulation
+from mpmopt.simulation import buffers
 from mpmopt.simulation.checkpoints import Checkpointing
 
 SMALL = case.Case(
@@ -139,8 +139,7 @@ def child(name: str, out: Path, phase: Path | None, on_disk: bool) -> int:
 
             return told
 
-        tell = telling(simulation.in_parallel, lambda *a: a[1].__name__)
-        buffers.in_parallel = simulation.in_parallel = tell  # the way forward, and back
+        buffers.in_parallel = telling(buffers.in_parallel, lambda *a: a[1].__name__)
         runfile.replace_file = telling(runfile.replace_file, lambda *a: "write")
     checkpointing = Checkpointing(every=7, store="disk") if on_disk else None
     return reported(

@@ -160,9 +160,9 @@ class Point:
     courant : float
     choice : str
     measured : Measured
-    travel_ratio : float
+    distance_ratio : float
         Distance over the reference's.
-    travel_error, gradient_error : float
+    distance_error, gradient_error : float
         Relative to the reference.
     angle : float
         Between the gradients, in degrees.
@@ -174,8 +174,8 @@ class Point:
     courant: float
     choice: str
     measured: Measured
-    travel_ratio: float = math.nan
-    travel_error: float = math.nan
+    distance_ratio: float = math.nan
+    distance_error: float = math.nan
     gradient_error: float = math.nan
     angle: float = math.nan
 
@@ -185,11 +185,11 @@ class Point:
 
     def against(self, reference: Measured) -> "Point":
         """The same with its errors."""
-        travel, gradient, angle = self.measured.errors(reference)
+        distance, gradient, angle = self.measured.errors(reference)
         return replace(
             self,
-            travel_ratio=self.measured.travel / reference.travel,
-            travel_error=travel,
+            distance_ratio=self.measured.distance / reference.distance,
+            distance_error=distance,
             gradient_error=gradient,
             angle=angle,
         )
@@ -201,7 +201,7 @@ class Point:
             "scene": self.scene, "choice": self.choice, "n": str(self.n),
             "steps": str(self.steps), "Courant": f"{self.courant:.3g}",
             "seconds": f"{measured.seconds:.3g}", "MB": f"{measured.megabytes:.3g}",
-            "travel": f"{measured.travel:.6g}", "travel error": f"{self.travel_error:.2e}",
+            "distance": f"{measured.distance:.6g}", "distance error": f"{self.distance_error:.2e}",
             "gradient norm": f"{np.linalg.norm(measured.gradient):.4g}",
             "gradient error": f"{self.gradient_error:.2e}", "angle": f"{self.angle:.1f}",
             "failure": measured.failure,
@@ -276,10 +276,10 @@ def measure_bar(n: int, courant: float, choice: Choice) -> Measured:
     here = replace(Discretisation.of(scene), precision=choice.precision)
     try:
         bar.value_and_gradient()  # kernels are compiled then
-        (travel, gradient), seconds = timed(bar.value_and_gradient)
+        (distance, gradient), seconds = timed(bar.value_and_gradient)
     except MpmoptError as error:
         return Measured(here, failure=str(error))
-    return Measured(here, seconds, math.nan, travel, gradient)
+    return Measured(here, seconds, math.nan, distance, gradient)
 
 
 def measure_robot(name: str, scene: Scene, n: int, courant: float, choice: Choice) -> Measured:
@@ -306,7 +306,7 @@ def measure_point(
     )
     return {
         "steps": measured.discretisation.steps, "seconds": measured.seconds,
-        "megabytes": measured.megabytes, "travel": measured.travel,
+        "megabytes": measured.megabytes, "distance": measured.distance,
         "gradient": measured.gradient, "failure": measured.failure,
     }  # fmt: skip
 
@@ -379,7 +379,7 @@ def peer_point(name: str, robot: str) -> Point:
     scene = ROBOTS[robot][0]
     gradient = np.array(result["gradient"])
     measured = Measured(
-        Discretisation.of(scene), result["seconds"], result["megabytes"], result["travel"],
+        Discretisation.of(scene), result["seconds"], result["megabytes"], result["distance"],
         gradient, "" if np.all(np.isfinite(gradient)) else "its gradient is not a number",
     )  # fmt: skip
     print(f"{robot}, {name}: {measured.seconds:.2f} s", file=sys.stderr, flush=True)
@@ -416,7 +416,7 @@ def print_peer(name: str, robot: str) -> None:
                 "seconds": seconds,
                 "megabytes": next(int(s.split()[1]) for s in status if s.startswith("VmHWM"))
                 / 1024,
-                "travel": value - objective.start,
+                "distance": value - objective.start,
                 "gradient": density(problem, gradient, PATCH, plane).tolist(),
             }
         )
@@ -451,8 +451,8 @@ def horizons(bench: Bench) -> list[dict[str, str]]:
             "robot": name, "formulation": formulation, "seconds simulated": f"{duration:g}",
         }  # fmt: skip
         for n, one in ((64, coarse), (128, middle)):
-            travel, gradient, angle = one.errors(fine)
-            row[f"distance, n = {n}"] = f"{travel:.0%}"
+            distance, gradient, angle = one.errors(fine)
+            row[f"distance, n = {n}"] = f"{distance:.0%}"
             row[f"gradient, n = {n}"] = f"{gradient:.0%}, {angle:.0f} deg"
         rows.append(row)
     return rows
@@ -470,13 +470,13 @@ def manufactured() -> list[dict[str, str]]:
     return rows
 
 
-def travels(points: Sequence[Point]) -> list[dict[str, str]]:
+def distances(points: Sequence[Point]) -> list[dict[str, str]]:
     """Distance by step, over the reference's: one line for each robot, formulation and n."""
     rows = []
     for name, formulation in robots():
         for n in sorted({p.n for p in points}):
             line = {
-                p.courant: p.travel_ratio
+                p.courant: p.distance_ratio
                 for p in points
                 if (p.scene, p.formulation, p.n) == (name, formulation, n)
                 and p.choice in SWEPT
@@ -501,7 +501,7 @@ def robots() -> list[tuple[str, Formulation]]:
     ]
 
 
-ERRORS = {"distance": "travel_error", "gradient": "gradient_error"}
+ERRORS = {"distance": "distance_error", "gradient": "gradient_error"}
 LEVELS = (0.2, 0.15, 0.1, 0.05, 0.02, 0.01, 0.005, 0.001)
 
 
@@ -538,7 +538,7 @@ class Cost:
         return self.between(lambda point: point.measured.seconds)
 
 
-def cost(points: Sequence[Point], level: float, error: str = "travel_error") -> Cost | None:
+def cost(points: Sequence[Point], level: float, error: str = "distance_error") -> Cost | None:
     """The least that some points take to be off by at most so much, and not by chance.
 
     All with finer cells must be so too, as in `discretisation.cheapest`. Between two numbers of
@@ -675,15 +675,15 @@ def write_h5(
         for (name, formulation), reference in references.items():
             mine = [p for p in points if (p.scene, p.formulation) == (name, formulation)]
             group = file.create_group(f"{name}, {formulation}")
-            group.attrs["reference travel"] = reference.travel
+            group.attrs["reference distance"] = reference.distance
             group.create_dataset("reference gradient", data=reference.gradient)
             columns = {
                 "n": [p.n for p in mine], "steps": [p.steps for p in mine],
                 "courant": [p.courant for p in mine],
                 "seconds": [p.measured.seconds for p in mine],
                 "megabytes": [p.measured.megabytes for p in mine],
-                "travel": [p.measured.travel for p in mine],
-                "travel_error": [p.travel_error for p in mine],
+                "distance": [p.measured.distance for p in mine],
+                "distance_error": [p.distance_error for p in mine],
                 "gradient_error": [p.gradient_error for p in mine],
                 "angle": [p.angle for p in mine],
             }  # fmt: skip
@@ -714,7 +714,7 @@ def draw(path: Path, points: Sequence[Point], known: dict[str, tuple[float, floa
     path : Path
     points : sequence of Point
     known : mapping of str to (float, float)
-        By scene, how well its reference is known: travel and gradient.
+        By scene, how well its reference is known: distance and gradient.
     """
     import matplotlib
 
@@ -728,7 +728,10 @@ def draw(path: Path, points: Sequence[Point], known: dict[str, tuple[float, floa
     for column, (name, title) in enumerate(TITLES.items()):
         mine = [p for p in points if p.scene == name and not p.measured.failure]
         for row, (error, what) in enumerate(
-            (("travel_error", "error of the distance"), ("gradient_error", "error of the gradient"))
+            (
+                ("distance_error", "error of the distance"),
+                ("gradient_error", "error of the gradient"),
+            )
         ):
             ax = axes[row, column]
             _scatter(ax, mine, error, markers, known[name][row])
@@ -817,7 +820,7 @@ def _steps(ax, points: Sequence[Point]) -> None:
     for n, colour in COLOURS.items():
         for choice, style in STYLES.items():
             line = sorted(
-                (p.courant, p.travel_ratio) for p in points if (p.n, p.choice) == (n, choice)
+                (p.courant, p.distance_ratio) for p in points if (p.n, p.choice) == (n, choice)
             )
             mark = "o" if choice == PLAIN.name else "D"
             ax.plot(*zip(*line) if line else ([], []), style + mark, color=colour, ms=5, lw=1.2)
@@ -886,9 +889,11 @@ def chart(path: Path, bench: Bench, quick: bool, peers: bool) -> None:
         points += [peer_point(name, robot) for robot in walled for name in PEERS]
     points = [p.against(references[p.scene, p.formulation]) for p in points]
     write_csv(Path(f"{path}.csv"), [p.row() for p in points])
-    write_csv(Path(f"{path}_travel.csv"), travels(points))
+    write_csv(Path(f"{path}_distance.csv"), distances(points))
     fronts = [
-        p for name in TITLES for p in front([q for q in points if q.scene == name], "travel_error")
+        p
+        for name in TITLES
+        for p in front([q for q in points if q.scene == name], "distance_error")
     ]
     write_csv(Path(f"{path}_front.csv"), [p.row() for p in fronts])
     on_both = {name: known[name] for name in known if name not in walled}
@@ -902,8 +907,8 @@ def chart(path: Path, bench: Bench, quick: bool, peers: bool) -> None:
     write_h5(Path(f"{path}.h5"), points, references)
     draw(Path(f"{path}.png"), points, known)
     print(machine())
-    for scene, (travel, gradient) in known.items():
-        print(f"{scene}: reference known to {travel:.2%} of travel, {gradient:.1%} of the gradient")
+    for scene, (distance, gradient) in known.items():
+        print(f"{scene}: distance known to {distance:.2%}, gradient to {gradient:.1%}")
 
 
 @dataclass(frozen=True)
@@ -931,7 +936,9 @@ class Limit:
     def extrapolated(self) -> Measured:
         """The finest, with the distance that it and the next tend to (Richardson 1911)."""
         _, middle, fine = self.measured
-        return replace(fine, travel=fine.travel + self._left * (fine.travel - middle.travel))
+        return replace(
+            fine, distance=fine.distance + self._left * (fine.distance - middle.distance)
+        )
 
     @property
     def distance_left(self) -> float:
@@ -939,7 +946,7 @@ class Limit:
 
         No limit is known better than that: the order may not be reached yet.
         """
-        return abs(self.measured[-1].travel / self.extrapolated.travel - 1.0)
+        return abs(self.measured[-1].distance / self.extrapolated.distance - 1.0)
 
     @property
     def gradient_left(self) -> float:
@@ -957,8 +964,8 @@ class Limit:
         row = {"scene": self.scene, "formulation": self.formulation}
         row["Courant"] = f"{self.courant:g}"
         for n, one in zip(self.cells, self.measured):
-            row[f"distance, n = {n}"] = f"{one.travel:.5f}"
-        row["limit"] = f"{self.extrapolated.travel:.5f}"
+            row[f"distance, n = {n}"] = f"{one.distance:.5f}"
+        row["limit"] = f"{self.extrapolated.distance:.5f}"
         for n, one in zip(self.cells, self.measured):
             _, gradient, angle = one.errors(reference)
             row[f"gradient off by, n = {n}"] = f"{gradient:.1%}, {angle:.1f} deg"
@@ -982,7 +989,7 @@ def mean(one: Measured, other: Measured) -> Measured:
     """Halfway between two."""
     return replace(
         one,
-        travel=0.5 * (one.travel + other.travel),
+        distance=0.5 * (one.distance + other.distance),
         gradient=0.5 * (one.gradient + other.gradient),
     )
 

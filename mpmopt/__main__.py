@@ -312,11 +312,11 @@ def cheapest(path: Path, tol: float, gradient_tol: float | None, seconds: float)
         )
     print(f"reference                {found.reference.discretisation}")
     own = (found.objective_uncertainty, found.gradient_uncertainty)
-    travel, gradient = ("unknown" if value != value else f"{value:.1%}" for value in own)
-    print(f"its own uncertainty      travel {travel}, gradient {gradient}")
+    distance, gradient = ("unknown" if value != value else f"{value:.1%}" for value in own)
+    print(f"its own uncertainty      distance {distance}, gradient {gradient}")
     if found.other_reference is not None:
         print(f"other formulation        {found.other_reference.discretisation}")
-        apart = f"travel {found.objective_apart:.1%}, gradient {found.gradient_apart:.1%}"
+        apart = f"distance {found.objective_apart:.1%}, gradient {found.gradient_apart:.1%}"
         print(f"apart from it            {apart}")
     label = "cheapest near it" if found.doubt else f"cheapest within {tol:.3g}"
     print(f"{label:<24} {found.best}")
@@ -538,13 +538,13 @@ def _parser() -> argparse.ArgumentParser:
         "cheapest",
         "find the cheapest discretisation that is accurate enough",
         "Measure the best design in one discretisation after the other, from the cheapest on,\n"
-        "until travel and gradient agree with the finest that is affordable; in both formulations\n"
+        "until distance and gradient agree with the finest affordable one; in both formulations\n"
         "where the scene has no walls.",
         "out/walker/run.h5 --tol 0.1",
         "out/walker/run.h5 --tol 0.05 --gradient-tol inf --seconds 300",
     )
     command.add_argument(
-        "--tol", type=float, default=0.05, help="relative tolerance of travel and gradient (0.05)"
+        "--tol", type=float, default=0.05, help="relative tolerance of distance and gradient (0.05)"
     )
     command.add_argument("--gradient-tol", type=float, help="another one of the gradient; inf: any")
     command.add_argument(

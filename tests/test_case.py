@@ -30,6 +30,7 @@ from mpmopt.errors import DesignError, RunFileError, StorageError
 from mpmopt.optimisation.loop import optimise
 from mpmopt.optimisation.settings import Settings, Stage
 from mpmopt.results import runfile
+from mpmopt.validation import digits
 from mpmopt.view import plot
 from mpmopt.view.live import ProgressBar, most_evaluations
 
@@ -148,12 +149,12 @@ def test_a_run_of_another_case_is_never_overwritten(folder):
 
 @pytest.mark.parametrize("how", ["the picture fails", "matplotlib cannot be imported"])
 def test_a_picture_that_fails_spoils_no_run(tmp_path, caplog, monkeypatch, how):
-    def fails(path, body):
+    def fails(path, motion):
         raise RuntimeError("latex was not able to process the string\nwith a log\nof many lines")
 
     with monkeypatch.context() as patch:
         if how == "the picture fails":
-            patch.setattr(plot, "plot_motion", fails)
+            patch.setattr(plot, "_plot_motion", fails)
         else:
             patch.setitem(sys.modules, "mpmopt.view.plot", None)
         summary = run(TINY, tmp_path)
@@ -281,6 +282,15 @@ def test_progress_tells_the_best_that_meets_all_constraints_in_a_short_line(boun
         assert float(found[2]) == pytest.approx(max(values) - run.origin, rel=1e-2)
 
 
+def test_progress_counts_what_was_before_and_tells_displacements(short_run, capsys):
+    first = short_run.history[0]
+    begun = dataclasses.replace(short_run, stop_reason="", stage=0, history=[first] * 10)
+    ProgressBar()(begun)  # of a run that is gone on with
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"10 of {most_evaluations(begun)} evaluations, ")
+    assert f"displacement {digits(first.objective - begun.origin, 3)}, best " in line
+
+
 def test_the_number_of_evaluations_is_known_from_the_stages(short_run):
     stages = SMALL.settings.stages
     stages = (*stages, dataclasses.replace(stages[1], most_iterations=7))
@@ -291,6 +301,8 @@ def test_the_number_of_evaluations_is_known_from_the_stages(short_run):
     assert most_evaluations(begun) == 2 + 19 + 20 + 7  # what failed is done again
     early = dataclasses.replace(begun, stage=1, history=[first] * 9)
     assert most_evaluations(early) == 9 + 20 + 7
+    over = dataclasses.replace(begun, history=[first] * 25)  # five too many
+    assert most_evaluations(over) == 25 + 20 + 7
 
 
 def test_the_walkers_settings_are_those_of_the_design():

@@ -287,7 +287,7 @@ def test_a_subpixel_design_is_measured_as_such_in_other_discretisations():
     problems = [Problem(scene, 2.0, subpixel=whether) for whether in (False, True)]
     own, other = (problem.value(problem.join(field, 0.5, 0.0, 0.0)) for problem in problems)
     assert own != other
-    assert subpixel.travel - plain.travel == pytest.approx(other - own, abs=1e-14)
+    assert subpixel.distance - plain.distance == pytest.approx(other - own, abs=1e-14)
 
 
 @pytest.mark.parametrize("subpixel", [False, True])

@@ -66,8 +66,8 @@ def test_patches_hold_the_whole_gradient_and_compare_whole_bodies_with_half_ones
     half = measure(whole, Discretisation.of(whole, mirror=plane), design, 2.0, 1 / 32)
     # Measured with the plane in the scene, the whole body's gradient is folded about it.
     both = measure(replace(whole, mirror=plane), Discretisation.of(whole), design, 2.0, 1 / 32)
-    travel, norm, angle = half.errors(both)
-    assert travel <= 1e-10
+    distance, norm, angle = half.errors(both)
+    assert distance <= 1e-10
     assert norm <= 1e-10
     assert angle <= 1e-5
 
@@ -77,7 +77,7 @@ def test_errors_are_those_of_vectors():
     here = Discretisation.of(scene)
     reference = Measured(here, 1.0, 1.0, 0.1, np.array([3.0, 4.0]))
     assert reference.errors(reference) == (0.0, 0.0, 0.0)
-    twice = replace(reference, travel=0.12, gradient=np.array([6.0, 8.0]))
+    twice = replace(reference, distance=0.12, gradient=np.array([6.0, 8.0]))
     assert twice.errors(reference) == pytest.approx((0.2, 1.0, 0.0), abs=1e-6)
     across = replace(reference, gradient=np.array([-4.0, 3.0]))
     assert across.errors(reference) == pytest.approx((0.0, math.sqrt(2.0), 90.0))
@@ -89,7 +89,7 @@ def test_a_failure_is_evidence_not_an_end():
     too_long = replace(Discretisation.of(scene), steps=2)
     measured = measure(scene, too_long, smooth, 1.0, 1 / 8)
     assert "time_step" in measured.failure
-    assert np.isnan(measured.travel)
+    assert np.isnan(measured.distance)
 
 
 def test_single_precision_loses_digits_but_few():
@@ -99,8 +99,8 @@ def test_single_precision_loses_digits_but_few():
         measure(scene, replace(here, precision=precision), smooth, 2.0, 1 / 16)
         for precision in ("double", "single")
     )
-    travel, gradient, angle = single.errors(double)
-    assert 0.0 < travel <= 1e-4
+    distance, gradient, angle = single.errors(double)
+    assert 0.0 < distance <= 1e-4
     assert 0.0 < gradient <= 1e-3
     assert angle <= 0.1
     assert single.megabytes == pytest.approx(double.megabytes / 2, rel=0.05)
@@ -175,7 +175,7 @@ def test_both_formulations_are_measured_each_against_its_own_finest():
     apart = found.other_reference.errors(found.reference)
     assert (found.objective_apart, found.gradient_apart) == apart[:2]
     assert 1e-9 < found.objective_apart < 0.5
-    assert f"differ in travel by {found.objective_apart:.3g}" in found.doubt
+    assert f"differ in distance by {found.objective_apart:.3g}" in found.doubt
     loose = replace(found, tolerance=0.5, objective_uncertainty=0.1)
     assert loose.doubt == ""
     walled = cheapest(small_scene(steps=8), smooth, 1e9)
@@ -232,7 +232,7 @@ def test_the_command_prints_evidence_and_what_it_found(tmp_path, capsys):
     assert sum("within" in line for line in printed[:-1]) >= 2
     assert main(["cheapest", str(path), "--tol", "1e-9"]) == 0
     *_, own, best, doubt = capsys.readouterr().out.splitlines()
-    assert own.startswith("its own uncertainty      travel ")
+    assert own.startswith("its own uncertainty      distance ")
     assert best.startswith("cheapest near it")
     assert "asked for is 1e-09" in doubt
 
@@ -255,7 +255,7 @@ def test_a_tolerance_below_what_the_reference_knows_is_named():
     scene = small_scene(steps=8)
     found = cheapest(scene, smooth, 1e-6)
     assert found.objective_uncertainty > 1e-6
-    assert f"travel to {found.objective_uncertainty:.3g}, asked for is 1e-06" in found.doubt
+    assert f"distance to {found.objective_uncertainty:.3g}, asked for is 1e-06" in found.doubt
     assert "seconds" in found.doubt
     assert cheapest(scene, smooth, 1e9).doubt == ""
     loose = replace(found, tolerance=1e9, gradient_tolerance=math.inf)
@@ -275,10 +275,10 @@ def test_a_body_that_does_not_travel_is_compared_with_what_rounding_does():
     here = Discretisation.of(small_scene())
     still = Measured(here, 1.0, 1.0, 0.0, np.zeros(2), size=1.0)
     assert still.errors(still)[:2] == (0.0, 0.0)
-    hardly = replace(still, travel=3e-17, gradient=np.array([0.0, 2e-17]))
+    hardly = replace(still, distance=3e-17, gradient=np.array([0.0, 2e-17]))
     assert max(hardly.errors(still)[:2]) <= 1e-4
     assert max(still.errors(hardly)[:2]) <= 1e-4
-    goes = replace(still, travel=0.1, gradient=np.array([0.1, 0.0]))
+    goes = replace(still, distance=0.1, gradient=np.array([0.1, 0.0]))
     assert min(goes.errors(still)[:2]) > 1e9
     assert replace(goes, size=0.0).errors(replace(still, size=0.0))[:2] == (math.inf, math.inf)
     body = (Actuator((0.25, 0.25), (0.5, 0.5)),)

@@ -4,12 +4,22 @@ import numpy as np
 import pytest
 from conftest import small_scene
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_rgb
 from matplotlib.patches import Rectangle
 
 from mpmopt.assess.trajectory import Motion, optimised, reference
 from mpmopt.design.problem import Problem
 from mpmopt.scene import Grid, Ground, Scene, Solid, Wall
-from mpmopt.view.draw import BLUE, RED, Squares, draw_walls, format_of, new_figure, set_view
+from mpmopt.view.draw import (
+    BLUE,
+    LAYER,
+    RED,
+    Squares,
+    draw_walls,
+    format_of,
+    new_figure,
+    set_view,
+)
 
 
 def drawn(motion, box, frame=0):
@@ -159,6 +169,29 @@ def test_walls_are_drawn_where_bodies_rest_on_them(place, side, gravity):
 )
 def test_numbers_have_three_digits_of_their_range_in_any_unit(values, shown):
     assert [f"{value:{format_of(values)}}" for value in values] == shown
+
+
+def test_the_layer_of_the_ground_is_shaded_as_far_as_it_bears(rng):
+    c = 1 / 16
+    points = ((0.0, 3 * c), (0.5, 2 * c), (0.5, 5 * c), (1.0, 4 * c))
+    scene = small_scene(walls=(), ground=(Ground(points, thickness=c),))
+    figure = new_figure(4.0, 4.0)
+    figure.set_layout_engine("none")
+    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+    axes.set_axis_off()
+    set_view(axes, np.array([(0.0, 0.0), (1.0, 1.0)]))
+    draw_walls(axes, scene)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    image = np.asarray(canvas.buffer_rgba())[::-1, :, :3] / 255.0
+    place = rng.uniform(0.02, 0.98, (2, 4000))
+    colour = image[tuple(np.floor(place[::-1] * len(image)).astype(int))]
+    d, _ = scene.ground[0].distance(place)
+    within, outside = (d > 0.2 * c) & (d < 0.9 * c), d > 1.1 * c
+    assert within.sum() > 100 and outside.sum() > 100
+    assert np.all(abs(colour[within] - to_rgb(LAYER)) < 0.01)
+    assert np.all(colour[outside] == 1.0)
+    assert not np.any(np.all(abs(colour[d < -0.2 * c] - to_rgb(LAYER)) < 0.01, axis=1))
 
 
 def test_a_small_step_of_the_ground_has_a_dark_outline():

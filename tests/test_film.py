@@ -16,7 +16,14 @@ from PIL import Image
 from test_mirror import channel
 
 from mpmopt.__main__ import main
-from mpmopt.assess.trajectory import Motion, equal_steps, optimised, post_processed, reference
+from mpmopt.assess.trajectory import (
+    Motion,
+    equal_steps,
+    moving,
+    optimised,
+    post_processed,
+    reference,
+)
 from mpmopt.design.problem import Problem
 from mpmopt.errors import (
     DesignError,
@@ -246,6 +253,21 @@ def bursts(problem, x):
     raise SimulationError("it burst", 3, -1, (np.nan, np.nan), "take another")
 
 
+def test_a_body_that_needs_a_shorter_step_moves_in_half_of_it(short_run):
+    problem, x = short_run.problem(), short_run.result.x
+    step = problem.scene.time_step
+
+    def needs_half(there, x):
+        return optimised(there, x) if there.scene.time_step < 0.6 * step else bursts(there, x)
+
+    makes = optimised, bursts, needs_half
+    (_, whole), (body, half) = moving(problem, x, makes, lambda scene: equal_steps(scene, 5))
+    assert body.simulation.scene.time_step == half.scene.time_step == step / 2.0
+    assert half.frames * half.scene.time_step == pytest.approx(whole.frames * step, abs=step)
+    assert half.frames[-1] == half.scene.steps == 2 * problem.scene.steps
+    assert half.objective[-1] == pytest.approx(whole.objective[-1], rel=1e-2)
+
+
 def test_a_body_that_cannot_be_simulated_is_left_out(short_run, tmp_path, monkeypatch, caplog):
     film(tmp_path / "three.gif", short_run, seconds=0.4)
     monkeypatch.setattr(films, "post_processed", bursts)
@@ -333,7 +355,7 @@ def test_a_design_whose_void_bursts_has_its_picture_without_grey(
     plot.PICTURES["design"](tmp_path / "design.png", short_run)
     plot.PICTURES["post_processed"](tmp_path / "bare.png", short_run)
     assert (tmp_path / "design.png").read_bytes() == (tmp_path / "bare.png").read_bytes()
-    assert "the picture is of the design without grey: " in caplog.text
+    assert "a body is left out: " in caplog.text
 
 
 def test_a_run_without_a_design_has_no_film(tmp_path):

@@ -88,24 +88,31 @@ def test_an_optimisation_shows_a_bar_and_below_it_its_best_design(places, monkey
     assert capfd.readouterr() == ("", "")
 
 
-def test_pictures_take_a_tenth_of_the_time(places, monkeypatch):
+@pytest.mark.parametrize(
+    ("picture", "evaluation", "times"),
+    [
+        (0.5, 1.0, [1.0, 6.5, 12.0, 14.5]),  # five seconds after the last, and at the end
+        (0.01, 0.4, [0.4, 1.61, 2.82, 4.03, 5.24]),  # not before a second is over
+    ],
+)
+def test_pictures_take_a_tenth_of_the_time(places, monkeypatch, picture, evaluation, times):
     clock = [0.0]
     shown = []
 
     class Slow:
         def show(self, thing):
             shown.append(clock[0])
-            clock[0] += 0.5  # seconds that a picture takes
+            clock[0] += picture
 
     monkeypatch.setattr(live, "Place", Slow)
     monkeypatch.setattr(live.time, "monotonic", lambda: clock[0])
 
     def later(run):
-        clock[0] += 1.0
+        clock[0] += evaluation
 
     settings = Settings(SHORT.stages, window=1, least_iterations=12, most_iterations=12)
     optimise(small_scene(steps=4), settings, {}, [later, live.ProgressBar()])
-    assert shown == [1.0, 6.5, 12.0, 14.5]  # five seconds after the last, and at the end
+    assert shown == pytest.approx(times)
 
 
 def test_a_bar_of_ones_own_is_the_only_one(places):

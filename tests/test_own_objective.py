@@ -73,7 +73,7 @@ def test_pictures_and_measurements_take_every_term(term):
     assert motion.objective[-1] == problem.value(x)
     assert np.all(np.isfinite(motion.objective))
     measured = measure(SCENE, Discretisation.of(SCENE), smooth, 2.0, 1 / 16, task=problem.task)
-    assert np.isfinite(measured.travel)
+    assert np.isfinite(measured.distance)
 
 
 def test_checks_and_measurements_are_of_it(pair):
@@ -85,7 +85,7 @@ def test_checks_and_measurements_are_of_it(pair):
     here = Discretisation.of(SCENE)
     measured = measure(SCENE, here, smooth, 2.0, 1 / 16, task=OWN)
     expected = measure(pair[1].scene, here, smooth, 2.0, 1 / 16)
-    assert measured.travel == expected.travel
+    assert measured.distance == expected.distance
     assert np.array_equal(measured.gradient, expected.gradient)
     found = cheapest(SCENE, x, 1e9, beta=2.0, task=OWN, seconds=1e-2)
     assert found.best in {row.measured.discretisation for row in found.rows}

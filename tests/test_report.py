@@ -168,7 +168,7 @@ def test_a_body_that_cannot_be_simulated_is_left_out(
     assert [film["name"] for film in data_of(tmp_path / "a.html")["films"]] == [
         "post-processed design"
     ]
-    assert "without a body: step 3, body: it burst" in caplog.text
+    assert "a body is left out: step 3, body: it burst" in caplog.text
 
 
 def test_each_constraint_is_told_with_value_bound_and_multiplier(short_run, short_path, tmp_path):

@@ -262,7 +262,7 @@ def test_a_study_tells_speeds_and_shares(told):
     }
     assert found["failures"]["strength 1.2"] == "it burst"
     assert found["followed"] == {"seconds": 20.0, "end": "goes on"}
-    assert set(found) == {*robustness.NAMES, "failures"}
+    assert set(found) == {*robustness.NAMES, "failures", "shorter_steps_of_speed"}
     assert json.loads(json.dumps(found)) == found
     assert "speed by cells, total, 32" in table(found)
     few = study_of(on_ground(), full=False)
@@ -284,7 +284,7 @@ def test_a_run_on_other_cells_that_fails_is_made_again_with_half_its_step(monkey
 
     monkeypatch.setattr(robustness, "speed", fails)
     found = study_of(scene, full=False)
-    assert found["shorter_steps"] == {"cells 2": fine / 2.0}
+    assert found["shorter_steps_of_speed"] == {"cells 2": fine / 2.0}
     assert found["kept"] == {"half_step": None, "finer_cells": 1.0}
     assert found["failures"] == {"step 0.5": "it burst"}
 
@@ -296,7 +296,7 @@ def test_no_share_of_a_robot_that_stays_where_it_is(told):
         found = study_of(on_ground())
         assert found["speed"] == nominal
         if nominal is not None:
-            back = found["failures"]["shares"].startswith(robustness.GOES_BACK)
+            back = found["failures"]["shares"].startswith("the robot goes back")
             assert back is (nominal < 0.0)
         assert {*found["kept"].values(), found["driven_share"], found["after_push"]} == {None}
 
@@ -310,6 +310,8 @@ def test_a_robot_on_walls_has_no_study():
     [
         ("goes on", lambda t: 0.1 * t, lambda t: 1.0 + 0 * t, lambda t: 0.2 * np.sin(t)),
         ("goes on", lambda t: 0.1 * t, lambda t: np.where(t < 0.5, 3.0, 1.0), lambda t: 0 * t),
+        ("goes on", lambda t: 0.1 * (t - np.clip(t - 9, 0, 1.5)), np.ones_like, np.zeros_like),
+        ("goes on", lambda t: 0.1 * np.maximum(t - 1.9, 0.0), np.ones_like, np.zeros_like),
         ("falls", lambda t: 0.1 * t, lambda t: np.where(t < 6.0, 1.0, 0.4), lambda t: 0 * t),
         ("falls", lambda t: 0.1 * t, lambda t: 1.0 + 0 * t, lambda t: np.where(t < 6.0, 0.0, -0.8)),
         ("stops", lambda t: 0.1 * np.minimum(t, 6.0), lambda t: 1.0 + 0 * t, lambda t: 0 * t),
@@ -412,14 +414,15 @@ def test_a_full_study_is_kept_with_its_run(told, tmp_path, capsys):
     with pytest.raises(DesignError, match="unfinished run"):
         full_study(path)
     run = optimise(scene, SHORT, Problem(scene).join(0.3, 1.0, -0.3, -0.5))
-    rows, steps = {"cells half as wide": 0.9}, {"cells half as wide": 1e-3, "cells 2": 5e-4}
-    runfile.write(path, run, {"evaluations": 2, "retained_gain": rows, "shorter_steps": steps})
+    steps = {"shorter_steps": {"cells half as wide": 1e-3}}
+    runfile.write(path, run, {"evaluations": 2, **steps, "shorter_steps_of_speed": {"cells 2": 1}})
     text = full_study(path)
     assert "kept, finest cells" in text
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert runfile.read_run(path).summary == summary
     assert (summary["evaluations"], summary["speed"]) == (2, 0.1)
-    assert summary["shorter_steps"] == {"cells half as wide": 1e-3}  # cells 2 needed none now
+    assert summary["shorter_steps"] == {"cells half as wide": 1e-3}
+    assert summary["shorter_steps_of_speed"] == {}  # cells 2 needed none now
     assert (tmp_path / "robustness.png").read_bytes().startswith(b"\x89PNG")
     told({})
     assert full_study(path) == text  # it is not made again

@@ -13,7 +13,7 @@ from walker import CASES, walker
 
 from mpmopt.design.chain import DesignChain
 from mpmopt.errors import SceneError
-from mpmopt.scene import Actuator, Design, Grid, Material, Region, Scene, Solid, Wall
+from mpmopt.scene import Actuator, Design, Grid, Material, Mirror, Region, Scene, Solid, Wall
 from mpmopt.scene.particles import discretise
 
 
@@ -88,7 +88,10 @@ WRONG: Any = ((1.0, 2.0), "left")  # of types that mypy refuses
         (lambda: Design((0.2, 0.2), (0.1, 0.3)), ["0.2", "0.1"]),
         (lambda: Actuator((0, 0), (1, 1), stress=((1.0, 2.0), (3.0, 1.0))), ["2.0", "3.0"]),
         (lambda: Actuator((0, 0), (1, 1), stress=WRONG[0]), ["2 entries"]),
+        (lambda: Solid((1, 0), (1, 2)), ["(1.0, 0.0)", "left of and below", "(1.0, 2.0)"]),
+        (lambda: Solid((0, 2), (1, 2)), ["(0.0, 2.0)", "left of and below", "(1.0, 2.0)"]),
         (lambda: Wall("y", 0.1, friction=-0.5), ["-0.5"]),
+        (lambda: Mirror("y", math.nan), ["Mirror", "position", "nan"]),
         (lambda: Wall("y", 0.1, solid_side=WRONG[1]), ["left"]),
         (lambda: small_scene(direction=(1.0, 1.0)), ["1.41421356", "length 1"]),
         (lambda: small_scene(filter_weights=(0.5, 0.1, 0.1)), ["1.3", "sum to 1"]),

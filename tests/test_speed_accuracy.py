@@ -32,9 +32,9 @@ BARS = (("bar", "updated"), ("bar", "total"))
 
 def bar_errors(n, courant, **options):
     bar = Bar(n, courant, **options)
-    (travel, gradient), (exact, exact_gradient) = bar.value_and_gradient(), bar.exact()
+    (distance, gradient), (exact, exact_gradient) = bar.value_and_gradient(), bar.exact()
     error = np.linalg.norm(gradient - exact_gradient) / np.linalg.norm(exact_gradient)
-    return abs(travel / exact - 1.0), error
+    return abs(distance / exact - 1.0), error
 
 
 def test_the_bar_is_off_by_the_volumes_of_the_step_before():
@@ -42,9 +42,9 @@ def test_the_bar_is_off_by_the_volumes_of_the_step_before():
     # units of v0 / (2 w) sin(w t), and with w t = 2 pi + pi / 4, that is (4 / pi - 1) w dt.
     bar = Bar(64, 0.8)
     step = bar.simulation.scene.time_step
-    travel, gradient = bar_errors(64, 0.8)
-    assert travel == pytest.approx((4.0 / np.pi - 1.0) * bar.omega * step, rel=0.05)
-    assert gradient <= 1.2 * travel
+    distance, gradient = bar_errors(64, 0.8)
+    assert distance == pytest.approx((4.0 / np.pi - 1.0) * bar.omega * step, rel=0.05)
+    assert gradient <= 1.2 * distance
 
 
 def test_the_bar_and_its_gradient_converge_with_cells_and_step_together():
@@ -85,8 +85,8 @@ def test_every_resolution_sees_the_same_robot(name):
 def test_the_time_at_equal_accuracy_is_of_points_that_are_not_right_by_chance():
     def point(n, seconds, error, choice=PLAIN, scene="bar"):
         here = Discretisation((n, n), 1, formulation=choice.formulation)
-        measured = Measured(here, seconds, travel=1.0)
-        return Point(scene, n, 1, 0.4, choice.name, measured, travel_error=error)
+        measured = Measured(here, seconds, distance=1.0)
+        return Point(scene, n, 1, 0.4, choice.name, measured, distance_error=error)
 
     points = [
         point(32, 1.0, 0.009), point(64, 4.0, 0.1), point(128, 16.0, 0.01),
@@ -109,7 +109,7 @@ def test_the_time_at_equal_accuracy_is_of_points_that_are_not_right_by_chance():
 def test_peers_take_as_long_as_the_particles_and_steps_that_mls_mpm_needs():
     def point(n, seconds, choice, scene="bar", formulation="updated"):
         measured = Measured(Discretisation((n, n), 100, formulation=formulation), seconds)
-        return Point(scene, n, 100, 0.4, choice, measured, travel_error=0.04)
+        return Point(scene, n, 100, 0.4, choice, measured, distance_error=0.04)
 
     points = [point(32, 1.0, PLAIN.name), point(16, 0.01, TOTAL.name, formulation="total")]
     for peer, seconds in (("Taichi, double", 0.4), ("Warp, double", 0.32), ("Taichi, single", 0.1)):
@@ -129,11 +129,13 @@ def test_peers_take_as_long_as_the_particles_and_steps_that_mls_mpm_needs():
 def test_a_limit_is_where_errors_of_order_two_vanish():
     cells = (64, 128, 192)
     measured = tuple(
-        Measured(Discretisation((n, n), 1), travel=2.0 + 3.0 / n**2, gradient=np.array([1.0, h**2]))
+        Measured(
+            Discretisation((n, n), 1), distance=2.0 + 3.0 / n**2, gradient=np.array([1.0, h**2])
+        )
         for n, h in zip(cells, (3.0, 1.5, 1.0))
     )
     found = speed_accuracy.Limit("walker on ground", "total", 0.2, cells, measured)
-    assert found.extrapolated.travel == pytest.approx(2.0, rel=1e-12)
+    assert found.extrapolated.distance == pytest.approx(2.0, rel=1e-12)
     assert found.distance_left == pytest.approx(1.5 / 192**2, rel=1e-9)
     assert found.extrapolated.gradient is measured[-1].gradient
     # The finest gradient is one off, and as long as the square root of two.
@@ -144,17 +146,17 @@ def test_the_front_is_a_front():
     rng = np.random.default_rng(5)
     here = Discretisation((4, 4), 1)
     points = [
-        Point("bar", 32, 1, 0.4, PLAIN.name, Measured(here, seconds), travel_error=error)
+        Point("bar", 32, 1, 0.4, PLAIN.name, Measured(here, seconds), distance_error=error)
         for seconds, error in rng.uniform(0.1, 1.0, (50, 2))
     ]
-    points.append(replace(points[0], travel_error=np.nan))
-    best = front(points, "travel_error")
+    points.append(replace(points[0], distance_error=np.nan))
+    best = front(points, "distance_error")
     assert 2 <= len(best) < 50
 
     def beats(one, other):
         return (
             one.measured.seconds <= other.measured.seconds
-            and one.travel_error <= other.travel_error
+            and one.distance_error <= other.distance_error
             and one is not other
         )
 
@@ -209,8 +211,8 @@ def test_a_chart_is_left_with_its_tables(tmp_path, monkeypatch, drawn):
         assert list(file) == sorted(f"{name}, {f}" for name, f in [*BARS, *robots()])
         for name, formulation in robots():
             group = file[f"{name}, {formulation}"]
-            travel = group["travel"][:] / group.attrs["reference travel"]
-            assert np.abs(travel - 1.0) == pytest.approx(group["travel_error"][:])
+            distance = group["distance"][:] / group.attrs["reference distance"]
+            assert np.abs(distance - 1.0) == pytest.approx(group["distance_error"][:])
             apart = np.linalg.norm(group["gradient"][:] - group["reference gradient"][:], axis=1)
             norm = np.linalg.norm(group["reference gradient"][:])
             assert apart / norm == pytest.approx(group["gradient_error"][:])

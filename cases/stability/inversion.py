@@ -144,8 +144,8 @@ def total_vortex(amplitude: float, cells: int, courant: float = 0.4) -> float:
     v = (at - of_nodes.position(-dt)) / dt
     v = v.reshape(2, lattice.rows + 2, -1)
     bent = 4.0 * v - sum(np.roll(v, k, axis) for k in (1, -1) for axis in (1, 2))
-    states = np.zeros((2, *simulation.start.shape))
-    states[0] = simulation.start
+    segment = simulation.segment(1)
+    states = segment.states
     there = lattice.mass > 0.0
     states[0, 2:] = np.where(there, (v + bent / 8.0).reshape(2, -1), 0.0)
     # What is two cells off the ring is held, so that no error turns the square.
@@ -157,7 +157,7 @@ def total_vortex(amplitude: float, cells: int, courant: float = 0.4) -> float:
         push = (to_nodes @ exact.force(step * dt).T).T[:, there]
         states[0, 2:, there] += dt * (push / lattice.mass[there]).T
         try:
-            simulation._advance(states, 0, 1, 0)
+            segment.advance(0, 1)
         except SimulationError as error:
             raise SimulationError(
                 error.what, step, error.particle, error.position, error.hint

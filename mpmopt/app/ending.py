@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from mpmopt.app.case import RESULTS
-from mpmopt.assess.robustness import GOES_BACK
 from mpmopt.io.console import command
 from mpmopt.optimisation.history import Optimisation
 from mpmopt.results import runfile
@@ -94,9 +93,10 @@ def _elsewhere(summary: Mapping[str, Any]) -> dict[str, str]:
     speed = f"{_shown(summary['speed'])} after the transient{share}"
     followed = summary.get("followed") or {"end": "goes on"}
     end = followed["end"]
-    shares = summary.get("failures", {}).get("shares", "")
-    stands = "; it goes back" if shares.startswith(GOES_BACK) else "; it stands" if shares else ""
-    went = stands if end == "goes on" else f"; at {digits(followed['seconds'], 3)}: {end}"
+    slow = ""
+    if "shares" in summary.get("failures", {}):
+        slow = "; it goes back" if summary["speed"] < 0.0 else "; it stands"
+    went = slow if end == "goes on" else f"; at {digits(followed['seconds'], 3)}: {end}"
     return {"speed": f"{speed}{went}; by friction: {by_friction}"}
 
 

@@ -56,12 +56,7 @@ def full_study(path: str | os.PathLike[str]) -> str:
                 def show(name: str, speed: float) -> None:
                     progress.step(f"{name}: {'failed' if math.isnan(speed) else digits(speed, 3)}")
 
-                # Those of the refinement study, which is not made again, stay.
-                shorter, rows = summary.pop("shorter_steps", {}), summary.get("retained_gain", ())
-                shorter = {name: step for name, step in shorter.items() if name in rows}
                 summary |= robustness.study(problem, x, full=True, progress=show)
-                shorter |= summary.pop("shorter_steps", {})
-                summary |= {"shorter_steps": shorter} if shorter else {}
             summary |= {"verdict": verdict_of(summary, kept.run)}
             text = json.dumps(summary, indent=1) + "\n"
             replace_file(path.parent / "summary.json", text.encode())

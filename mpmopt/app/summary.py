@@ -60,9 +60,6 @@ def summarise(
     def numbers(values: np.ndarray) -> float | list[float]:
         return float(values[0]) if values.size == 1 else values.tolist()
 
-    studied = robustness.study(problem, best.x, full)
-    shorter = {row.name: row.time_step for row in others if row.halved}
-    shorter |= studied.pop("shorter_steps", {})
     found = {
         "start": _value_or_none(lambda: first.objective),
         "reference": reference,
@@ -96,7 +93,8 @@ def summarise(
             for row in rows
         },
         "retained_gain": {row.name: _number_or_none(row.retained) for row in others},
-        **studied,
+        "shorter_steps": {row.name: row.time_step for row in others if row.halved},
+        **robustness.study(problem, best.x, full),
         "thinnest_member": _thinnest_member(problem, best.x),
         **_constraints(result),
         "non_discreteness": best.non_discreteness,
@@ -110,7 +108,6 @@ def summarise(
         "seconds": result.history[-1].seconds,
         "stop_reason": result.stop_reason,
     }
-    found |= {"shorter_steps": shorter} if shorter else {}
     return {"verdict": verdict_of(found, result), **found}
 
 

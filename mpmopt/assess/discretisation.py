@@ -140,29 +140,29 @@ class Measured:
         Of processor time, all threads together; compiling is not counted.
     megabytes : float
         Memory for states and nodes that the schedule of checkpoints takes.
-    travel : float
+    distance : float
         Objective L less where the body starts.
     gradient : (M,) array
         Its `density`.
     failure : str
         Why there are no numbers, or empty.
     size : float
-        Longest side of the grid: a travel of less than 1e-12 of it is rounding.
+        Longest side of the grid: a distance of less than 1e-12 of it is rounding.
     """
 
     discretisation: Discretisation
     seconds: float = math.nan
     megabytes: float = math.nan
-    travel: float = math.nan
+    distance: float = math.nan
     gradient: NDArray[np.float64] = field(default_factory=lambda: np.empty(0), repr=False)
     failure: str = ""
     size: float = 0.0
 
     def errors(self, reference: Measured) -> tuple[float, float, float]:
-        """Relative error of travel, relative error of the gradient, and the angle in degrees.
+        """Relative error of distance, relative error of the gradient, and the angle in degrees.
 
-        Against a reference whose gradient is summed over the same patches. Of a body that does not
-        travel, relative to what rounding may do.
+        Against a reference whose gradient is summed over the same patches. Of a body that goes no
+        distance, relative to what rounding may do.
         """
         if self.failure or reference.failure:
             return math.nan, math.nan, math.nan
@@ -174,12 +174,12 @@ class Measured:
             scale = max(whole, rounding)
             return difference / scale if scale > 0.0 else math.inf if difference > 0.0 else 0.0
 
-        travel = relative(abs(self.travel - reference.travel), abs(reference.travel))
+        distance = relative(abs(self.distance - reference.distance), abs(reference.distance))
         gradient = relative(float(np.linalg.norm(one - other)), lengths[1])
         if not all(lengths):
-            return travel, gradient, math.nan
+            return distance, gradient, math.nan
         cosine = float(one @ other) / (lengths[0] * lengths[1])
-        return travel, gradient, math.degrees(math.acos(min(1.0, max(-1.0, cosine))))
+        return distance, gradient, math.degrees(math.acos(min(1.0, max(-1.0, cosine))))
 
 
 def density(
@@ -330,7 +330,7 @@ class Evidence:
             return f"{name:<72}  failed: {self.measured.failure}"
         angle = "  none" if math.isnan(self.angle) else f"{self.angle:5.1f} deg"
         return (
-            f"{name:<72}  {self.measured.seconds:8.3f} s  travel {self.measured.travel:10.4g}  "
+            f"{name:<72}  {self.measured.seconds:8.3f} s  distance {self.measured.distance:10.4g}  "
             f"off by {self.objective_error:7.2%}  gradient {self.gradient_error:7.2%}, "
             f"{angle:<9}  {'within' if self.within else ''}"
         )
@@ -374,7 +374,7 @@ class Cheapest:
     def doubt(self) -> str:
         """Where the tolerances are below what the reference knows, a sentence that says so."""
         parts = (
-            ("travel", self.objective_uncertainty, self.tolerance),
+            ("distance", self.objective_uncertainty, self.tolerance),
             ("the gradient", self.gradient_uncertainty, self.gradient_tolerance),
         )
         unknown = [
@@ -386,7 +386,7 @@ class Cheapest:
         apart = [
             f"{name} by {own:.3g}"
             for name, own, asked in (
-                ("travel", self.objective_apart, self.tolerance),
+                ("distance", self.objective_apart, self.tolerance),
                 ("the gradient", self.gradient_apart, self.gradient_tolerance),
             )
             if own > asked

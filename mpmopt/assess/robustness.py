@@ -64,7 +64,6 @@ TRIALS = {
     "half_step": "step 0.5", "finer_cells": "cells 2", "finest_cells": "cells 4",
     "other_formulation": "other 2",
 }  # fmt: skip
-GOES_BACK = "the robot goes back"  # why it has no shares
 TOO_LONG = "particles times steps are more than"  # why a run was left out
 # Particles times steps of one run, in the short study and in the full: longer ones are left out.
 MOST_WORK, MOST_WORK_FULL = 1.5e8, 5e9
@@ -391,9 +390,9 @@ def study(
         full a quarter as wide, and half as wide in the other formulation; ``driven_share``, what is
         missing when the actuation is held; ``after_push``, the share of the speed that it has after
         a push; ``followed``, how long it goes on and what ends it; ``components``, before loose
-        pieces are dropped; ``failures``, why a number is None; and ``shorter_steps``, if there are
-        any, the steps of runs with other cells or in the other formulation that fail with the step
-        that they should have. Only the components where there is no ground or no actuator.
+        pieces are dropped; ``failures``, why a number is None; and ``shorter_steps_of_speed``,
+        the steps of runs with other cells or in the other formulation that fail with the step that
+        they should have. Only the components where there is no ground or no actuator.
 
     Raises
     ------
@@ -412,7 +411,7 @@ def study(
 
     least = LEAST * max(scene.extent)
     if nominal is not None and not nominal > least:
-        why = GOES_BACK if nominal < -least else "the robot stands"
+        why = "the robot goes back" if nominal < 0.0 else "the robot stands"
         failures["shares"] = f"{why}: a speed of less than {least:.2g} has no shares"
 
     def share(name: str) -> float | None:
@@ -452,7 +451,7 @@ def study(
             },
             "followed": vars(follow(robot, scene)),
         }
-    return found | {"failures": failures} | ({"shorter_steps": shorter} if shorter else {})
+    return found | {"failures": failures, "shorter_steps_of_speed": shorter}
 
 
 def _trials(scene: Scene, full: bool) -> dict[str, Trial]:

@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import logging
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mpmopt.assess.threshold import kept, solid_body, solid_reference
 from mpmopt.design.problem import Problem
+from mpmopt.design.step_control import with_halvings
 from mpmopt.design.term import Outcome, Term
+from mpmopt.errors import SimulationError
 from mpmopt.kernels import parts
 from mpmopt.scene import Mirror, Scene
 from mpmopt.scene.particles import own
 from mpmopt.simulation.simulation import Simulation
+
+logger = logging.getLogger(__name__)
 
 # Particles with less gamma than this are void: they do not count where a body is looked for.
 SEEN = 0.1
@@ -194,6 +200,52 @@ class Motion:
         """Lower and upper corner (2, 2) of where particles with material are at all instants."""
         seen = self.position[:, :, self.gamma >= SEEN]
         return np.array([seen.min(axis=(0, 2)), seen.max(axis=(0, 2))], dtype=float)
+
+
+Make = Callable[[Problem, NDArray[np.float64]], Body]
+Frames = Callable[[Scene], NDArray[np.int64]]
+
+
+def moving(
+    problem: Problem, x: NDArray[np.float64], makes: Sequence[Make], frames: Frames
+) -> Iterator[tuple[Body, Motion]]:
+    """A design's bodies and how they move, one after the other.
+
+    Where one fails its step is halved, as often as the problem's evaluations may: they had other
+    scenes, or another body. One that fails all the same is left out, which a warning tells.
+
+    Parameters
+    ----------
+    problem : Problem
+    x : (n,) array
+    makes : sequence of callable
+        What makes a body of problem and x, such as `optimised`.
+    frames : callable
+        Instants of a motion in a body's scene, such as `equal_steps`.
+
+    Raises
+    ------
+    SimulationError
+        As the first body, if none can be simulated.
+    """
+    failures = []
+    for make in makes:
+        try:
+            found, _ = with_halvings(problem, partial(_moved, make, frames, x), problem.halvings)
+        except SimulationError as error:
+            logger.warning("a body is left out: %s", error)
+            failures.append(error)
+        else:
+            yield found
+    if len(failures) == len(makes):
+        raise failures[0]
+
+
+def _moved(
+    make: Make, frames: Frames, x: NDArray[np.float64], problem: Problem
+) -> tuple[Body, Motion]:
+    body = make(problem, x)
+    return body, Motion.of(body, frames(body.simulation.scene))
 
 
 def equal_steps(scene: Scene, count: int, first: int = 0) -> NDArray[np.int64]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from mpmopt.assess.robustness import GOES_BACK, TOO_LONG, TRIALS
+from mpmopt.assess.robustness import TOO_LONG, TRIALS
 from mpmopt.validation import digits
 
 # A robot that loses more than a fifth with half the step, on finer cells or in the other
@@ -53,7 +53,7 @@ def verdict(summary: Mapping[str, Any], missed: Sequence[str] = (), travels: boo
     if missed:
         return f"breaks a constraint: {'; '.join(missed)}"
     if studied and "shares" in failures:
-        word = "goes back" if failures["shares"].startswith(GOES_BACK) else "stands"
+        word = "goes back" if value < 0.0 else "stands"
         return f"{word}: its speed along the way is {digits(value, 3)}"
     if followed and followed["end"] in ("falls", "stops"):
         return f"{followed['end']}: at t = {digits(followed['seconds'], 3)}"

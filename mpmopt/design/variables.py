@@ -60,7 +60,7 @@ def completed(owner: str, start: Mapping[str, Any]) -> dict[str, Any]:
     DesignError
         If it has another name in it.
     """
-    if unknown := set(start) - set(START):
+    if unknown := [name for name in start if name not in START]:
         raise DesignError(
             f"{owner}: start has {', '.join(map(str, unknown))}; its names are {', '.join(START)}"
         )

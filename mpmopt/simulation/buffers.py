@@ -61,6 +61,11 @@ class Segment:
         kept = length * simulation.room[0] * kernels.NODE_SIZE
         self.most = max(MOST_NUMBERS, 4 * kept)
         self.reserve(*simulation.room, 0)
+        self.states[0] = kernels.grouped(simulation.initial)
+
+    def state(self, slot: int) -> NDArray:
+        """The state (12, N) of the particles in a slot."""
+        return kernels.ungrouped(self.states[slot], *self.simulation.initial.shape)
 
     def reserve(self, nodes: int, part: int, step: int) -> None:
         """`resize`, unless that would take far more memory than the run began with."""
@@ -119,13 +124,47 @@ class Segment:
             elif end == kernels.PART_TOO_SMALL:
                 self.reserve(nodes, int(1.25 * window[:-1].max()), first + reached)
             elif end != kernels.DONE:
-                shape = simulation.initial.shape
-                particle = min(particle, shape[1] - 1)
-                state = kernels.ungrouped(self.states[reached % len(self.states)], *shape)
+                particle = min(particle, simulation.initial.shape[1] - 1)
+                state = self.state(reached % len(self.states))
                 raise _failure(simulation, end, first + reached, particle, state)
 
+    def advance_adjoint(
+        self,
+        first: int,
+        last: int,
+        start: int,
+        stop: int,
+        state_bar: NDArray,
+        bar: kernels.ParticleDataBar,
+        signal_bar: NDArray,
+    ) -> None:
+        """The adjoint of steps `start` to `stop` of a segment, from the last to the first."""
+        simulation = self.simulation
+        part_bar = np.zeros((self.blocks, last - first, signal_bar.shape[1]), state_bar.dtype)
+        in_parallel(
+            self.blocks,
+            kernels.advance_adjoint,
+            self.states,
+            self.grids,
+            self.windows,
+            self.logs,
+            start - first,
+            stop - first,
+            simulation.data,
+            simulation.parameters_of_steps(first, last),
+            simulation.signal[first:last],
+            self.scratch,
+            state_bar,
+            bar,
+            part_bar,
+        )
+        signal_bar[start:stop] = part_bar[:, start - first : stop - first].sum(axis=0)
+
     def store(self, index: int, checkpoints: Checkpoints) -> None:
-        """Store the whole segment, or only its states if its windows outgrew their room."""
+        """Store the state in slot 0, or the whole segment; without nodes if they outgrew it."""
+        if not checkpoints.schedule.all_stored:
+            checkpoints.write(index, state=self.state(0))
+            return
         used = int(self.windows[:, -1, 2:].prod(axis=1).max())
         if used > self.simulation.room[0]:
             self.recomputed.add(index)

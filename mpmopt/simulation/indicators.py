@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mpmopt import kernels
 from mpmopt.errors import DesignError
 from mpmopt.simulation.energy import LOOK, Balance
 from mpmopt.validation import shown
 
 if TYPE_CHECKING:
+    from mpmopt.simulation.buffers import Segment
     from mpmopt.simulation.simulation import Simulation
 
 # States are looked at for their indicators once in so many steps, and at the end.
@@ -104,27 +104,37 @@ def looked_at(first: int, last: int, steps: int, every: int) -> list[int]:
 class Watcher:
     """What is seen of a run: its indicators so far, and the states that were asked for."""
 
-    def __init__(self, simulation: Simulation, instants: Collection[int]) -> None:
+    def __init__(self, segment: Segment, instants: Collection[int]) -> None:
+        simulation = segment.simulation
+        self._segment, self._look = segment, simulation.looks()
         self._wanted = wanted_steps(instants, simulation.steps)
         self.states: dict[int, NDArray] = {}
-        self.simulation, self._seen = simulation, Indicators()
-        self._balance = Balance(simulation.data, simulation.parameters, simulation.signal)
+        self.indicators = Indicators()
 
-    def follow(self, states: NDArray, first: int, last: int) -> None:
+    def follow(self, first: int, last: int) -> None:
         """Look at steps `first` to `last`, whose states are in slots 0, 1, ..."""
-        self._balance.follow(states, first, last)
         for step in sorted(self._wanted - set(self.states)):
             if first <= step <= last:
-                shape = self.simulation.initial.shape
-                self.states[step] = kernels.ungrouped(states[step - first], *shape)
-        for slot in looked_at(first, last, self.simulation.steps, WATCH):
-            self._seen = self._seen.join(self.simulation.indicators(states[slot]))
-            if (first + slot) % LOOK == 0 or first + slot == self.simulation.steps:
-                gap = self.simulation.gap(states[slot])
-                self._seen = self._seen.join(
-                    self._seen._replace(gap=gap[0], gap_x=gap[1], gap_y=gap[2])
-                )
+                self.states[step] = self._segment.state(step - first)
+        self.indicators = self.indicators.join(self._look(self._segment.states, first, last))
 
-    @property
-    def indicators(self) -> Indicators:
-        return self._seen._replace(energy=self._balance.appeared)
+
+class Looks:
+    """Takes the indicators of a run's states, steps after steps."""
+
+    def __init__(self, simulation: Simulation) -> None:
+        self._simulation = simulation
+        self._balance = Balance(simulation.data, simulation.parameters, simulation.signal)
+
+    def __call__(self, states: NDArray, first: int, last: int) -> Indicators:
+        """Those of steps `first` to `last`, whose states are in slots 0, 1, ..."""
+        simulation, seen = self._simulation, Indicators()
+        self._balance.follow(states, first, last)
+        for slot in looked_at(first, last, simulation.steps, WATCH):
+            seen = seen.join(simulation.indicators(states[slot]))
+            if (first + slot) % LOOK == 0 or first + slot == simulation.steps:
+                gap, x, y = simulation.gap(states[slot])
+                seen = seen.join(Indicators(gap=gap, gap_x=x, gap_y=y))
+        if last == simulation.steps:
+            seen = seen._replace(energy=self._balance.appeared)
+        return seen

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,8 +16,8 @@ from mpmopt.scene.parts import Vector
 from mpmopt.simulation.buffers import Memory
 from mpmopt.simulation.checkpoints import Checkpointing, Checkpoints, Schedule
 from mpmopt.simulation.energy import LOOK
-from mpmopt.simulation.indicators import Indicators, Watched, looked_at, wanted_steps
-from mpmopt.simulation.simulation import Forward, Gradient, Simulation, check_terminal_adjoints
+from mpmopt.simulation.indicators import Indicators, looked_at
+from mpmopt.simulation.simulation import Gradient, Simulation
 from mpmopt.simulation.surroundings import holders
 
 
@@ -28,6 +28,8 @@ class LagrangianSimulation(Simulation):
     the same layout, whose affine velocity is zero. Its own state are nodes (4, M): position and
     velocity.
     """
+
+    at_once = LOOK
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
@@ -227,76 +229,26 @@ class LagrangianSimulation(Simulation):
         position = N.T @ x_bar.T + Gx.T @ F_bar[:, 0].T + Gy.T @ F_bar[:, 1].T
         return np.concatenate([position, N.T @ v_bar.T], axis=1).T.copy()
 
-    def _advance(self, states: NDArray, first: int, last: int, begin: int) -> None:
-        """Steps `first` to `last`; slots and signals are counted from step `begin`."""
-        signal = self.signal[begin:]
-        lattice = self.lattice._replace(clamps=self.parameters.clamps[begin:])
-        step = first
-        while step < last:
-            stop = min(last, step + self.steps_per_call)
-            reached, node = lagrangian.advance_lattice(
-                states, step - begin, stop - begin, lattice, signal
-            )
-            if node >= 0:
-                x, y = (float(c) for c in np.real(states[reached % len(states), :2, node]))
-                raise SimulationError(
-                    "a node is not a number", begin + reached, -1, (x, y),
-                    f"take a smaller time step (now {self.scene.time_step:g}), a higher void "
-                    "density or weaker actuation",
-                )  # fmt: skip
-            step = stop
-
-    def run(self, frames: Sequence[int] | None = None) -> NDArray:
-        """As `Simulation.run`."""
-        kept = [self.particle_state(nodes) for nodes in self._nodes_at(self._wanted(frames))]
-        return kept[-1] if frames is None else np.array(kept)
-
-    def _nodes_at(self, wanted: list[int]) -> Iterator[NDArray]:
-        """States (4, M) of the nodes after so many steps each, to be used at once."""
-        states = np.zeros((2, *self.start.shape), self.start.dtype)
-        states[0] = self.start
-        step = 0
-        for frame in wanted:
-            self._advance(states, step, frame, step)
-            if (frame - step) % 2:
-                states[0] = states[1]
-            step = frame
-            yield states[0]
-
     def pushed(self, step: int, velocity: Vector) -> LagrangianSimulation:
         """As `Simulation.pushed`."""
-        (nodes,) = self._nodes_at([step])
-        other = self._from(step)
-        other.start = nodes.copy()
+        other, segment = self._from(step), self.segment(1)
+        segment.advance(0, step)
+        other.start = segment.states[step % 2].copy()
         other.start[2:] += np.reshape(velocity, (2, 1))
         return other
 
-    def states(self) -> Iterator[NDArray]:
-        """As `Simulation.states`."""
-        yield from map(self.particle_state, self.node_states())
-
     def node_states(self) -> Iterator[NDArray]:
         """The states (4, M) of the nodes after 0, 1, ... steps, one after the other."""
-        states = np.zeros((2, *self.start.shape), self.start.dtype)
-        states[0] = self.start
+        segment = self.segment(self.at_once)
         yield self.start
-        for step in range(self.steps):
-            self._advance(states, step, step + 1, step)
-            states[0] = states[1]
-            yield states[0].copy()
+        for first, last in self._parts(segment):
+            yield from segment.states[1 : last - first + 1].copy()
 
-    def watch(self, instants: Collection[int] = ()) -> Watched:
-        """As `Simulation.watch`."""
-        watcher = _Watcher(self, instants)
-        length = min(LOOK, self.steps)
-        states = np.zeros((length + 1, *self.start.shape), self.start.dtype)
-        states[0] = self.start
-        for first in range(0, self.steps, LOOK):
-            last = min(first + LOOK, self.steps)
-            self._advance(states, first, last, first)
-            watcher.follow(states, first, last)
-            states[0] = states[last - first]
-        return Watched(watcher.states, watcher.seen)
+    def looks(self) -> Callable[[NDArray, int, int], Indicators]:
+        """As `Simulation.looks`."""
+        return lambda states, first, last: self.look(
+            states, looked_at(first, last, self.steps, LOOK)
+        )
 
     def look(self, states: NDArray, slots: Sequence[int]) -> Indicators:
         """Indicators of states of the nodes, slots of `states` (., 4, M).
@@ -323,14 +275,29 @@ class LagrangianSimulation(Simulation):
             arrays = {"states": ((schedule.segment + 1, *self.start.shape), dtype)}
         return Checkpoints(schedule, arrays)
 
-    def forward(
-        self,
-        checkpoints: Checkpoints,
-        memory: Memory | None = None,
-        instants: Collection[int] = (),
-    ) -> LagrangianForward:
-        """As `Simulation.forward`."""
-        return LagrangianForward(self, checkpoints, memory or Memory(), instants)
+    def segment(self, length: int, memory: Memory | None = None) -> Any:
+        """As `Simulation.segment`."""
+        return NodeSegment(self, length, memory or Memory())
+
+    def state_bar(self, terminal: NDArray) -> NDArray:
+        """As `Simulation.state_bar`: that of the nodes (4, M)."""
+        return self.particle_state_adjoint(terminal).astype(self.start.dtype)
+
+    def zero_bar(self) -> lagrangian.LatticeBar:
+        """As `Simulation.zero_bar`."""
+        return lagrangian.LatticeBar.zeros(self.lattice, self.start.dtype)
+
+    def gradient(self, state_bar: NDArray, bar: Any, signal_bar: NDArray) -> Gradient:
+        """As `Simulation.gradient`; its state is that of the nodes (4, M)."""
+        lattice = self.lattice
+        width = 4 * (lattice.groups + 1)
+        mass_bar = self._folded(bar.mass, lattice.mirror_axis, lattice.columns, width)
+        return Gradient(
+            density=self.particles.volume * (self._weights[0] @ mass_bar),
+            stiffness=bar.stiffness.ravel()[self._slot] + self._grip_slope * bar.grip[self._seat],
+            signal=signal_bar,
+            state=state_bar,
+        )
 
     @property
     def steps_per_call(self) -> int:
@@ -338,112 +305,70 @@ class LagrangianSimulation(Simulation):
         return 1 + 1_000_000 // self.nodes
 
 
-class _Watcher:
-    """What is seen of a run: its indicators so far, and the states that were asked for."""
+class NodeSegment:
+    """The states of nodes of a segment, as `Segment`."""
 
-    def __init__(self, simulation: LagrangianSimulation, instants: Collection[int]) -> None:
-        self._wanted = wanted_steps(instants, simulation.steps)
-        self._simulation = simulation
-        self.states: dict[int, NDArray] = {}
-        self.seen = Indicators()
-
-    def follow(self, states: NDArray, first: int, last: int) -> None:
-        """Look at steps `first` to `last`, whose states are in slots 0, 1, ..."""
-        simulation = self._simulation
-        for step in self._wanted - set(self.states):
-            if first <= step <= last:
-                self.states[step] = simulation.particle_state(states[step - first])
-        slots = looked_at(first, last, simulation.steps, LOOK)
-        self.seen = self.seen.join(simulation.look(states, slots))
-
-
-class LagrangianForward(Forward):
-    """A forward run that is ready to be gone back through, as `Forward`."""
-
-    def __init__(
-        self,
-        simulation: LagrangianSimulation,
-        checkpoints: Checkpoints,
-        memory: Memory,
-        instants: Collection[int],
-    ) -> None:
-        self._simulation: Any = simulation
-        self._checkpoints, self._shared = checkpoints, memory
-        self._reversed = False
+    def __init__(self, simulation: LagrangianSimulation, length: int, memory: Memory) -> None:
+        self.simulation, self.memory = simulation, memory
         memory.runs += 1
-        self._run = memory.runs
-        schedule, dtype = checkpoints.schedule, simulation.start.dtype
-        watcher = _Watcher(simulation, instants)
-        self._states = memory.take("nodes", (schedule.segment + 1, *simulation.start.shape), dtype)
-        self._states[0] = simulation.start
-        for index, (first, last) in enumerate(schedule.segments):
-            if not schedule.all_stored:
-                checkpoints.write(index, state=self._states[0])
-            simulation._advance(self._states, first, last, first)
-            watcher.follow(self._states, first, last)
-            if last < schedule.steps:
-                if schedule.all_stored:
-                    checkpoints.write(index, states=self._states)
-                self._states[0] = self._states[last - first]
-        self.states, self.indicators = watcher.states, watcher.seen
+        self.run = memory.runs
+        start = simulation.start
+        self.states = memory.take("nodes", (length + 1, *start.shape), start.dtype)
+        self.states[0] = start
+        self.recomputed: set[int] = set()
 
-    @property
-    def recomputed_segments(self) -> int:
-        """Segments that `reverse` recomputes."""
-        schedule = self._checkpoints.schedule
-        return 0 if schedule.all_stored else len(schedule.segments) - 1
+    def state(self, slot: int) -> NDArray:
+        """As `Segment.state`."""
+        return self.simulation.particle_state(self.states[slot])
 
-    def reverse(self, terminal_adjoints: Mapping[int, NDArray[np.float64]]) -> Gradient:
-        """As `Forward.reverse`; the gradient's state is that of the nodes (4, M)."""
-        simulation = self._simulation
-        steps, shape = simulation.steps, simulation.initial.shape
-        if self._reversed:
-            raise DesignError("this run was gone back through already; run forward again")
-        if self._shared.runs != self._run:
-            raise DesignError("another run took this one's memory; give each run its own")
-        check_terminal_adjoints(terminal_adjoints, shape, steps)
-        self._reversed = True
-        dtype = simulation.start.dtype
-
-        def bar_of(step: int) -> NDArray:
-            if step not in terminal_adjoints:
-                return np.zeros(simulation.start.shape, dtype)
-            return simulation.particle_state_adjoint(terminal_adjoints[step]).astype(dtype)
-
-        state_bar = bar_of(steps)
-        bar = lagrangian.LatticeBar.zeros(simulation.lattice, dtype)
-        signal_bar = np.zeros_like(simulation.signal)
-        for index, (first, last) in reversed([*enumerate(self._checkpoints.schedule.segments)]):
-            if last < steps:
-                self._recall(index, first, last)
-            stop = last - first
-            while stop > 0:
-                earlier = (step - first for step in terminal_adjoints if step < first + stop)
-                start = max(0, stop - simulation.steps_per_call, *earlier)
-                lagrangian.advance_lattice_adjoint(
-                    self._states, start, stop, simulation.lattice,
-                    simulation.signal[first:last], state_bar, bar, signal_bar[first:last],
+    def advance(self, first: int, last: int) -> None:
+        """As `Segment.advance`."""
+        simulation = self.simulation
+        clamps = simulation.parameters.clamps[first:]
+        lattice = simulation.lattice._replace(clamps=clamps)
+        step = first
+        while step < last:
+            stop = min(last, step + simulation.steps_per_call)
+            reached, node = lagrangian.advance_lattice(
+                self.states, step - first, stop - first, lattice, simulation.signal[first:]
+            )
+            if node >= 0:
+                x, y = self.states[reached % len(self.states), :2, node].real.tolist()
+                raise SimulationError(
+                    "a node is not a number", first + reached, -1, (x, y),
+                    f"take a smaller time step (now {simulation.scene.time_step:g}), a higher void "
+                    "density or weaker actuation",
                 )  # fmt: skip
-                stop = start
-                if first + start in terminal_adjoints:
-                    state_bar += bar_of(first + start)
-        lattice = simulation.lattice
-        mass_bar = simulation._folded(
-            bar.mass, lattice.mirror_axis, lattice.columns, 4 * (lattice.groups + 1)
-        )
-        volume = simulation.particles.volume
-        return Gradient(
-            density=volume * (simulation._weights[0] @ mass_bar),
-            stiffness=bar.stiffness.ravel()[simulation._slot]
-            + simulation._grip_slope * bar.grip[simulation._seat],
-            signal=signal_bar,
-            state=state_bar,
-        )
+            step = stop
 
-    def _recall(self, index: int, first: int, last: int) -> None:
-        """Bring the states of a segment back: read them, or recompute them."""
-        if self._checkpoints.schedule.all_stored:
-            self._states[:] = self._checkpoints.read(index, "states")
+    def advance_adjoint(
+        self,
+        first: int,
+        last: int,
+        start: int,
+        stop: int,
+        state_bar: NDArray,
+        bar: lagrangian.LatticeBar,
+        signal_bar: NDArray,
+    ) -> None:
+        """As `Segment.advance_adjoint`."""
+        simulation = self.simulation
+        lagrangian.advance_lattice_adjoint(
+            self.states, start - first, stop - first, simulation.lattice,
+            simulation.signal[first:last], state_bar, bar, signal_bar[first:last],
+        )  # fmt: skip
+
+    def store(self, index: int, checkpoints: Checkpoints) -> None:
+        """As `Segment.store`."""
+        if checkpoints.schedule.all_stored:
+            checkpoints.write(index, states=self.states)
         else:
-            self._states[0] = self._checkpoints.read(index, "state")
-            self._simulation._advance(self._states, first, last, first)
+            checkpoints.write(index, state=self.states[0])
+
+    def recall(self, index: int, first: int, last: int, checkpoints: Checkpoints) -> None:
+        """As `Segment.recall`."""
+        if checkpoints.schedule.all_stored:
+            self.states[:] = checkpoints.read(index, "states")
+        else:
+            self.states[0] = checkpoints.read(index, "state")
+            self.advance(first, last)

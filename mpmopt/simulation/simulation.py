@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -20,9 +20,8 @@ from mpmopt.scene.particles import Particles, of_solid
 from mpmopt.scene.parts import Vector
 from mpmopt.simulation.buffers import Memory, Segment
 from mpmopt.simulation.checkpoints import Checkpointing, Checkpoints, Schedule
-from mpmopt.simulation.indicators import WATCH, Indicators, Watched, Watcher
+from mpmopt.simulation.indicators import WATCH, Indicators, Looks, Watched, Watcher
 from mpmopt.simulation.surroundings import parameters_of
-from mpmopt.simulation.threads import in_parallel
 from mpmopt.validation import shown
 
 Precision = Literal["double", "single"]
@@ -82,6 +81,8 @@ class Simulation:
     DesignError
         If shapes do not fit, or a value is not finite or not positive where it must be.
     """
+
+    at_once = WATCH  # steps that are kept while a run is only looked at
 
     def __init__(
         self,
@@ -167,18 +168,13 @@ class Simulation:
             If a particle leaves the grid, inverts, or is not a number.
         """
         wanted = self._wanted(frames)
-        memory = Segment(self, 1, Memory())
-        states = memory.states
-        states[0] = kernels.grouped(self.initial)
-        kept = []
-        step = 0
+        segment = self.segment(1)
+        kept, step = [], 0
         for frame in wanted:
-            while step < frame:
-                last = min(frame, step + self.steps_per_call)
-                memory.advance(step, last)
-                states[0] = states[(last - step) % 2]
-                step = last
-            kept.append(kernels.ungrouped(states[0], *self.initial.shape))
+            segment.advance(step, frame)
+            segment.states[0] = segment.states[(frame - step) % 2]
+            kept.append(segment.state(0))
+            step = frame
         return kept[-1] if frames is None else np.array(kept)
 
     def _wanted(self, frames: Sequence[int] | None) -> list[int]:
@@ -227,15 +223,21 @@ class Simulation:
         SimulationError
             As `run`.
         """
-        memory = Segment(self, min(WATCH, self.steps), Memory())
-        memory.states[0] = kernels.grouped(self.initial)
-        yield self.initial
-        for first in range(0, self.steps, WATCH):
-            last = min(first + WATCH, self.steps)
-            memory.advance(first, last)
+        segment = self.segment(self.at_once)
+        yield segment.state(0)
+        for first, last in self._parts(segment):
             for slot in range(1, last - first + 1):
-                yield kernels.ungrouped(memory.states[slot], *self.initial.shape)
-            memory.states[0] = memory.states[last - first]
+                yield segment.state(slot)
+
+    def _parts(self, segment: Segment) -> Iterator[tuple[int, int]]:
+        """First step and the step after the last of what is in the segment, one after another."""
+        length = len(segment.states) - 1
+        for first in range(0, self.steps, length):
+            last = min(first + length, self.steps)
+            segment.advance(first, last)
+            yield first, last
+            if last < self.steps:  # the last steps stay for the way back
+                segment.states[0] = segment.states[last - first]
 
     def watch(self, instants: Collection[int] = ()) -> Watched:
         """Run forward: how the run ends, and how close it came to failure.
@@ -252,15 +254,15 @@ class Simulation:
         SimulationError
             As `run`.
         """
-        memory = Segment(self, min(WATCH, self.steps), Memory())
-        memory.states[0] = kernels.grouped(self.initial)
-        watcher = Watcher(self, instants)
-        for first in range(0, self.steps, WATCH):
-            last = min(first + WATCH, self.steps)
-            memory.advance(first, last)
-            watcher.follow(memory.states, first, last)
-            memory.states[0] = memory.states[last - first]
+        segment = self.segment(self.at_once)
+        watcher = Watcher(segment, instants)
+        for first, last in self._parts(segment):
+            watcher.follow(first, last)
         return Watched(watcher.states, watcher.indicators)
+
+    def looks(self) -> Callable[[NDArray, int, int], Indicators]:
+        """What takes the indicators of steps of a run, in their order (`Looks`)."""
+        return Looks(self)
 
     def indicators(self, records: NDArray) -> Indicators:
         """Those of a state, as records of groups (`grouped`), but for energy and gap."""
@@ -286,6 +288,10 @@ class Simulation:
     def parameters_of_steps(self, first: int, last: int) -> kernels.Parameters:
         """The surroundings, in which step `first` is number 0."""
         return self.parameters._replace(clamps=self.parameters.clamps[first:last])
+
+    def segment(self, length: int, memory: Memory | None = None) -> Segment:
+        """Room for so many steps, with the initial state in slot 0."""
+        return Segment(self, length, memory or Memory())
 
     @property
     def steps(self) -> int:
@@ -368,24 +374,34 @@ class Simulation:
         SimulationError
             As `run`.
         """
-        schedule = checkpoints.schedule
-        segment = Segment(self, schedule.segment, memory or Memory())
-        segment.states[0] = kernels.grouped(self.initial)
-        watcher = Watcher(self, instants)
-        for index, (first, last) in enumerate(schedule.segments):
-            if not schedule.all_stored:
-                state = kernels.ungrouped(segment.states[0], *self.initial.shape)
-                checkpoints.write(index, state=state)
-            segment.advance(first, last)
-            watcher.follow(segment.states, first, last)
-            if last < schedule.steps:
-                if schedule.all_stored:
-                    segment.store(index, checkpoints)
-                segment.states[0] = segment.states[last - first]
+        segment = self.segment(checkpoints.schedule.segment, memory)
+        watcher = Watcher(segment, instants)
+        for index, (first, last) in enumerate(self._parts(segment)):
+            watcher.follow(first, last)
+            if last < self.steps:
+                segment.store(index, checkpoints)
         return Forward(self, checkpoints, segment, watcher)
 
+    def state_bar(self, terminal: NDArray) -> NDArray:
+        """An adjoint (12, N) of the particles' state, as that of what is stepped."""
+        return kernels.grouped(terminal.astype(self.initial.dtype), repeat=False)
 
-def check_terminal_adjoints(
+    def zero_bar(self) -> Any:
+        """Adjoints of what stays the same in all steps, nothing accumulated yet."""
+        return kernels.ParticleDataBar.zeros(len(self.data.mass), self.initial.dtype)
+
+    def gradient(self, state_bar: NDArray, bar: Any, signal_bar: NDArray) -> Gradient:
+        """The gradient from the adjoints of all steps."""
+        shape = self.initial.shape
+        return Gradient(
+            density=self.particles.volume * kernels.ungrouped(bar.mass, 1, shape[1])[0],
+            stiffness=kernels.ungrouped(bar.stiffness, 1, shape[1])[0],
+            signal=signal_bar,
+            state=kernels.ungrouped(state_bar, *shape),
+        )
+
+
+def _check_terminal_adjoints(
     terminal_adjoints: Mapping[int, NDArray[np.float64]], shape: tuple[int, ...], steps: int
 ) -> None:
     """Adjoints of states of a shape after so many steps, or a DesignError."""
@@ -411,11 +427,11 @@ class Forward:
         self,
         simulation: Simulation,
         checkpoints: Checkpoints,
-        memory: Segment,
+        segment: Segment,
         watcher: Watcher,
     ) -> None:
         self.states, self.indicators = watcher.states, watcher.indicators
-        self._simulation, self._checkpoints, self._memory = simulation, checkpoints, memory
+        self._simulation, self._checkpoints, self._segment = simulation, checkpoints, segment
         self._reversed = False
 
     @property
@@ -423,7 +439,7 @@ class Forward:
         """Segments that `reverse` recomputes."""
         schedule = self._checkpoints.schedule
         if schedule.all_stored:
-            return len(self._memory.recomputed)
+            return len(self._segment.recomputed)
         return len(schedule.segments) - 1
 
     def reverse(self, terminal_adjoints: Mapping[int, NDArray[np.float64]]) -> Gradient:
@@ -444,55 +460,24 @@ class Forward:
         """
         if self._reversed:
             raise DesignError("this run was gone back through already; run forward again")
-        if self._memory.memory.runs != self._memory.run:
+        simulation, segment = self._simulation, self._segment
+        if segment.memory.runs != segment.run:
             raise DesignError("another run took this one's memory; give each run its own")
-        simulation, memory = self._simulation, self._memory
-        schedule = self._checkpoints.schedule
-        shape, dtype = simulation.initial.shape, simulation.initial.dtype
-        check_terminal_adjoints(terminal_adjoints, shape, schedule.steps)
+        shape, steps = simulation.initial.shape, simulation.steps
+        _check_terminal_adjoints(terminal_adjoints, shape, steps)
         self._reversed = True
-
-        def seed_of(step: int) -> NDArray:
-            terminal = terminal_adjoints[step] if step in terminal_adjoints else np.zeros(shape)
-            return kernels.grouped(terminal.astype(dtype), repeat=False)
-
-        bar = seed_of(schedule.steps)
-        data_bar = kernels.ParticleDataBar.zeros(len(simulation.data.mass), dtype)
+        state_bar = simulation.state_bar(terminal_adjoints.get(steps, np.zeros(shape)))
+        bar = simulation.zero_bar()
         signal_bar = np.zeros_like(simulation.signal)
-        segments = schedule.segments
-        for index in range(len(segments) - 1, -1, -1):
-            first, last = segments[index]
-            if last < schedule.steps:
-                memory.recall(index, first, last, self._checkpoints)
-            part_bar = np.zeros((memory.blocks, *signal_bar[first:last].shape), dtype)
-            stop = last - first
-            while stop > 0:
-                earlier = (step - first for step in terminal_adjoints if step < first + stop)
-                start = max(0, stop - simulation.steps_per_call, *earlier)
-                in_parallel(
-                    memory.blocks,
-                    kernels.advance_adjoint,
-                    memory.states,
-                    memory.grids,
-                    memory.windows,
-                    memory.logs,
-                    start,
-                    stop,
-                    simulation.data,
-                    simulation.parameters_of_steps(first, last),
-                    simulation.signal[first:last],
-                    memory.scratch,
-                    bar,
-                    data_bar,
-                    part_bar,
-                )
+        for index, (first, last) in reversed([*enumerate(self._checkpoints.schedule.segments)]):
+            if last < steps:
+                segment.recall(index, first, last, self._checkpoints)
+            stop = last
+            while stop > first:
+                earlier = (step for step in terminal_adjoints if step < stop)
+                start = max(first, stop - simulation.steps_per_call, *earlier)
+                segment.advance_adjoint(first, last, start, stop, state_bar, bar, signal_bar)
                 stop = start
-                if first + start in terminal_adjoints:
-                    bar += seed_of(first + start)
-            signal_bar[first:last] = part_bar.sum(axis=0)
-        return Gradient(
-            density=simulation.particles.volume * kernels.ungrouped(data_bar.mass, 1, shape[1])[0],
-            stiffness=kernels.ungrouped(data_bar.stiffness, 1, shape[1])[0],
-            signal=signal_bar,
-            state=kernels.ungrouped(bar, *shape),
-        )
+                if start in terminal_adjoints:
+                    state_bar += simulation.state_bar(terminal_adjoints[start])
+        return simulation.gradient(state_bar, bar, signal_bar)

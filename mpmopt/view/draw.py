@@ -37,6 +37,8 @@ LONGEST = 0.15
 # What is rigid, and the ground's outline, of which small steps shall be seen.
 SOLID: dict[str, Any] = {"facecolor": "0.88", "edgecolor": "0.6", "hatch": "//", "lw": 0.8}
 OUTLINE: dict[str, Any] = {"fill": False, "edgecolor": "0.1", "lw": 1.3}
+# Where the ground's layer bears: feet go in it, above the ground.
+LAYER = "#f3e8c8"
 
 
 @contextmanager
@@ -83,7 +85,7 @@ def format_of(values: ArrayLike) -> str:
 
 
 def draw_walls(axes: Axes, scene: Scene, moving: bool = False) -> None:
-    """Draw the walls, the ground, and clamps with their ways, as far as the axes reach now.
+    """Draw walls, ground with its layer, and clamps with their ways, as far as the axes reach now.
 
     Parameters
     ----------
@@ -107,6 +109,7 @@ def draw_walls(axes: Axes, scene: Scene, moving: bool = False) -> None:
             else ((left, start), right - left, end - start)
         )
         axes.add_patch(Rectangle(corner, width, height, **SOLID))
+    draw_layers(axes, scene)
     for ground in scene.ground:
         reach = 4.0 * (right - left + high - low)
         for style in (SOLID, OUTLINE):
@@ -116,6 +119,14 @@ def draw_walls(axes: Axes, scene: Scene, moving: bool = False) -> None:
         axes.add_patch(Rectangle(clamp.lower, width, height, fill=False, edgecolor="C1", ls="--"))
         way = np.array([d for _, d in clamp.path]).reshape(-1, 2)
         axes.plot(*(way + np.add(clamp.lower, clamp.upper) / 2.0).T, color="C1", lw=0.8)
+
+
+def draw_layers(axes: Axes, scene: Scene) -> None:
+    """Shade where the layers of ground bear, as far as the axes reach now, and the ground too."""
+    places = np.meshgrid(*(np.linspace(*ends, 200) for ends in (axes.get_xlim(), axes.get_ylim())))
+    for layer in scene.layers:
+        d, _ = layer.line.distance(np.array(places))
+        axes.contourf(*places, d, [-math.inf, layer.thickness], colors=LAYER)
 
 
 def ground_outline(ground: Ground, reach: float) -> NDArray[np.float64]:

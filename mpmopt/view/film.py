@@ -14,20 +14,28 @@ from typing import Any
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_rgb
 from numpy.typing import NDArray
 from PIL import Image
 
 from mpmopt.assess.forces import Books, books
 from mpmopt.assess.robustness import SEEN, SETTLED, Robot, can_be_studied, lasting, unit
-from mpmopt.assess.trajectory import Body, Motion, equal_steps, optimised, post_processed, reference
-from mpmopt.design.problem import Problem
-from mpmopt.errors import DesignError, MissingLibraryError, SimulationError, StorageError
+from mpmopt.assess.trajectory import (
+    Motion,
+    equal_steps,
+    moving,
+    optimised,
+    post_processed,
+    reference,
+)
+from mpmopt.errors import DesignError, MissingLibraryError, StorageError
 from mpmopt.io.files import replace_file
 from mpmopt.io.progress import Progress
 from mpmopt.optimisation.history import Optimisation
 from mpmopt.scene import Scene
 from mpmopt.view.draw import (
     BLUE,
+    LAYER,
     RED,
     Arrows,
     Forces,
@@ -259,12 +267,16 @@ def film(
     count = round(seconds * RATE) if 0.0 < seconds <= 600.0 else 0
     if count < 2:
         raise DesignError(f"film: seconds = {seconds!r} must be from {2 / RATE:g} to 600")
-    instants = equal_steps(scene, count, round(begin / scene.time_step))
+
+    def frames_of(scene: Scene) -> NDArray[np.int64]:
+        return equal_steps(scene, count, round(begin / scene.time_step))
+
     if finished:
         bodies = [body_of(Robot.of(problem, x), scene)]
-        motions = [Motion.of(bodies[0], instants)]
+        motions = [Motion.of(bodies[0], frames_of(scene))]
     else:
-        bodies, motions = _beside(problem, x, instants)
+        makes = optimised, post_processed, reference
+        bodies, motions = map(list, zip(*moving(problem, x, makes, frames_of)))
     slow = seconds / duration
     screen = Screen(motions, slow, [books(body.simulation) for body in bodies] if forces else ())
     with Progress("frames", screen.frames) as progress:
@@ -290,27 +302,9 @@ def film(
     return Filmed(count, seconds + LAST, slow, per_period, len(content), spans)
 
 
-def _beside(
-    problem: Problem, x: NDArray[np.float64], instants: NDArray[np.int64]
-) -> tuple[list[Body], list[Motion]]:
-    """The best design, the same without grey and the reference, if they can be simulated."""
-    bodies, motions, failures = [], [], []
-    for make in (optimised, post_processed, reference):
-        try:
-            body = make(problem, x)
-            motions.append(Motion.of(body, instants))
-            bodies.append(body)
-        except SimulationError as error:
-            logger.warning("the film is without a body: %s", error)
-            failures.append(error)
-    if not bodies:
-        raise failures[0]
-    return bodies, motions
-
-
 def palette() -> Image.Image:
-    """The colours that films have: greys, and red and blue from black over themselves to white."""
-    colours = [np.repeat(np.linspace(0.0, 1.0, 32)[:, None], 3, axis=1)]
+    """Those of films: greys, red and blue from black over themselves to white, and the layer's."""
+    colours = [np.repeat(np.linspace(0.0, 1.0, 32)[:, None], 3, axis=1), np.array([to_rgb(LAYER)])]
     for tint in (np.array(RED), np.array(BLUE)):
         share = np.linspace(0.0, 1.0, 17)[1:, None]
         colours += [share * tint, share[:-1] + (1.0 - share[:-1]) * tint]

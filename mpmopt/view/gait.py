@@ -16,6 +16,7 @@ from mpmopt.design.terms import Displacement
 from mpmopt.io.files import replace_file
 from mpmopt.scene import Scene
 from mpmopt.view.draw import (
+    LAYER,
     Squares,
     draw_walls,
     new_figure,
@@ -134,6 +135,8 @@ def plot_gait(path: str | os.PathLike[str], robot: Robot) -> None:
     place.set_ylabel("along the way")
     place.legend(fontsize=7, ncols=FEET + 1, frameon=False, loc="lower center",
                  bbox_to_anchor=(0.5, 1.0))  # fmt: skip
+    for layer in scene.layers:
+        height.axhspan(0.0, layer.thickness, color=LAYER)
     height.set_ylabel("above the\nground")
     ground.set_ylabel("load on\neach foot")
     ground.set_yticks(np.arange(len(found)) + 0.1,

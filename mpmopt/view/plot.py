@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,16 @@ from matplotlib.figure import Figure
 
 from mpmopt.assess.forces import Books
 from mpmopt.assess.robustness import Robot, can_be_studied
-from mpmopt.assess.trajectory import Body, Motion, equal_steps, optimised, post_processed, reference
+from mpmopt.assess.trajectory import (
+    Body,
+    Make,
+    Motion,
+    equal_steps,
+    moving,
+    optimised,
+    post_processed,
+    reference,
+)
 from mpmopt.errors import SimulationError
 from mpmopt.io.files import replace_file
 from mpmopt.optimisation.history import Optimisation
@@ -37,9 +47,11 @@ from mpmopt.view.schematic import schematic
 logger = logging.getLogger(__name__)
 
 
-@own_style()
+EIGHT = 8  # instants of a body that a run's pictures show
+
+
 def plot_motion(
-    path: str | os.PathLike[str], body: Body, pictures: int = 8, books: Books | None = None
+    path: str | os.PathLike[str], body: Body, pictures: int = EIGHT, books: Books | None = None
 ) -> None:
     """Write a PNG of a body at equal intervals from start to end.
 
@@ -58,7 +70,12 @@ def plot_motion(
     StorageError
         If the file cannot be written.
     """
-    motion = Motion.of(body, equal_steps(body.simulation.scene, pictures))
+    _plot_motion(path, Motion.of(body, equal_steps(body.simulation.scene, pictures)), books)
+
+
+@own_style()
+def _plot_motion(path: str | os.PathLike[str], motion: Motion, books: Books | None = None) -> None:
+    pictures = len(motion.frames)
     forces = None if books is None else Forces.of([motion], [books])
     box = view([motion]) if forces is None else forces.box
     width, height = box[1] - box[0]
@@ -66,7 +83,7 @@ def plot_motion(
     columns = min(columns, pictures)
     rows = -(-pictures // columns)
     figure = new_figure(wide * columns, (wide * height / width + 0.35) * rows + 0.4)
-    name = body.name[0].upper() + body.name[1:]
+    name = motion.name[0].upper() + motion.name[1:]
     longest = "" if forces is None else f", longest arrow {forces.largest:.3g}"
     figure.suptitle(f"{name}, L = {motion.objective[-1]:{format_of(motion.objective)}}{longest}")
     panels = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).ravel()
@@ -151,14 +168,11 @@ def overview(run: Optimisation) -> Figure:
     return figure
 
 
-def _plot_design(path: Path, run: Optimisation) -> None:
-    """The best design, or where its void fails, the same without grey."""
-    problem, x = run.problem(), run.result.x
-    try:
-        plot_motion(path, optimised(problem, x))
-    except SimulationError as error:
-        logger.warning("the picture is of the design without grey: %s", error)
-        plot_motion(path, post_processed(problem, x))
+def _plot_first(path: Path, run: Optimisation, *makes: Make) -> None:
+    """The first of these bodies of the best design that can be simulated."""
+    instants = partial(equal_steps, count=EIGHT)
+    _, motion = next(moving(run.problem(), run.result.x, makes, instants))
+    _plot_motion(path, motion)
 
 
 def _robot(run: Optimisation) -> Robot:
@@ -168,11 +182,9 @@ def _robot(run: Optimisation) -> Robot:
 PICTURES: dict[str, Callable[[Path, Optimisation], None]] = {
     "schematic": lambda path, run: replace_file(path, png(schematic(run.scene))),
     "history": lambda path, run: plot_history(path, run),
-    "design": _plot_design,
-    "post_processed": lambda path, run: plot_motion(
-        path, post_processed(run.problem(), run.result.x)
-    ),
-    "reference": lambda path, run: plot_motion(path, reference(run.problem(), run.result.x)),
+    "design": lambda path, run: _plot_first(path, run, optimised, post_processed),
+    "post_processed": lambda path, run: _plot_first(path, run, post_processed),
+    "reference": lambda path, run: _plot_first(path, run, reference),
     "stride": lambda path, run: plot_stride(path, _robot(run)),
     "gait": lambda path, run: plot_gait(path, _robot(run)),
 }

@@ -10,10 +10,10 @@ import base64
 import dataclasses
 import html
 import json
-import logging
 import os
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
+from contextlib import suppress
 from functools import partial
 from importlib import resources
 from io import BytesIO
@@ -29,8 +29,10 @@ from mpmopt.assess.refinement import mapped
 from mpmopt.assess.robustness import SEEN, SETTLED, can_be_studied, unit
 from mpmopt.assess.trajectory import (
     Body,
+    Make,
     Motion,
     equal_steps,
+    moving,
     optimised,
     post_processed,
     reference,
@@ -46,8 +48,6 @@ from mpmopt.scene import Scene
 from mpmopt.scene.particles import discretise, mirror_images
 from mpmopt.view.draw import FAINTEST, RED, ground_outline, view
 from mpmopt.view.film import periods, playing_time
-
-logger = logging.getLogger(__name__)
 
 PER_PERIOD = 16  # instants of a film in one period of the fastest actuator; between, it is straight
 FEWEST, MOST, MOST_IN_ALL = 80, 320, 960  # instants of a film, and of all together
@@ -83,12 +83,11 @@ def report(
         If the file cannot be written.
     """
     problem, x = run.problem(), run.result.x
-    films, bodies = [], _bodies(problem, x)
-    for make in bodies:
-        try:
-            films.append(_film(make(), min(MOST, MOST_IN_ALL // len(bodies))))
-        except SimulationError as error:
-            logger.warning("the report is without a body: %s", error)
+    films: list[dict[str, Any]] = []
+    makes = _makes(problem)
+    frames = partial(_frames, most=min(MOST, MOST_IN_ALL // len(makes)))
+    with suppress(SimulationError):  # which `moving` has told
+        films.extend(_film(motion) for _, motion in moving(problem, x, makes, frames))
     name = source.absolute().parent.name or str(source)
     content = {
         "name": name,
@@ -140,26 +139,27 @@ def _base64(values: NDArray[np.uint8]) -> str:
     return base64.b64encode(values.tobytes()).decode()
 
 
-def _bodies(problem: Problem, x: NDArray[np.float64]) -> list[Callable[[], Body]]:
+def _makes(problem: Problem) -> list[Make]:
     """What makes each body that is filmed: the design without grey also in each of its scenes."""
-    made: list[Callable[[], Body]] = [
-        partial(make, problem, x) for make in (post_processed, optimised, reference)
-    ]
-    for number, (variation, member) in enumerate(zip(problem.task.scenes, problem.members), 1):
-        name = f"post-processed design in scene {number}: {variation}"
-        made.append(partial(_in_scene, name[:100], problem, member, x))
-    return made
+    in_scenes = [partial(_in_scene, number) for number in range(len(problem.members))]
+    return [post_processed, optimised, reference, *in_scenes]
 
 
-def _in_scene(name: str, problem: Problem, member: Problem, x: NDArray[np.float64]) -> Body:
-    return solid(name, member, x, mapped(member.scene, problem, x))
+def _in_scene(number: int, problem: Problem, x: NDArray[np.float64]) -> Body:
+    member = problem.members[number]
+    name = f"post-processed design in scene {number + 1}: {problem.task.scenes[number]}"
+    return solid(name[:100], member, x, mapped(member.scene, problem, x))
 
 
-def _film(body: Body, most: int) -> dict[str, Any]:
-    """A body in motion at no more than so many instants, as the page's script reads it."""
-    scene = body.simulation.scene
+def _frames(scene: Scene, most: int) -> NDArray[np.int64]:
+    """Instants of a film, no more than so many."""
     count = int(np.clip(round(PER_PERIOD * periods(scene)), FEWEST, most)) + 1
-    motion = Motion.of(body, np.unique(equal_steps(scene, count)))
+    return np.unique(equal_steps(scene, count))
+
+
+def _film(motion: Motion) -> dict[str, Any]:
+    """A body in motion, as the page's script reads it."""
+    scene = motion.scene
     box = view([motion])
     drawn = np.flatnonzero(motion.gamma >= FAINTEST)
     order = drawn[np.argsort(motion.gamma[drawn], kind="stable")]
@@ -171,7 +171,7 @@ def _film(body: Body, most: int) -> dict[str, Any]:
     actuation = motion.actuation[:, order]
     signals, signal_of = np.unique(actuation, axis=1, return_inverse=True)
     return {
-        "name": body.name,
+        "name": motion.name,
         "time": motion.frames * scene.time_step,
         "settled": scene.transient,
         "seconds": playing_time(scene),
@@ -183,6 +183,7 @@ def _film(body: Body, most: int) -> dict[str, Any]:
         "signal": signal_of.ravel(),
         "motion": packed(motion, box, order),
         "solids": _solids(scene, box, motion.spacing),
+        "layers": [layer.thickness for layer in scene.layers],
         "travel": travel,
         "rise": rise,
         "feet": [
@@ -220,7 +221,7 @@ def packed(motion: Motion, box: NDArray[np.float64], order: NDArray[np.int64]) -
 
 
 def _solids(scene: Scene, box: NDArray[np.float64], spacing: float) -> list[NDArray[np.float64]]:
-    """Corners of all that is rigid, as far as it is within a box."""
+    """Corners of all that is rigid, the ground first, as far as it is within a box."""
     (left, low), (right, high) = box
     reach = 4.0 * float(np.ptp(box, axis=0).sum())
     solids = [ground_outline(ground, reach) for ground in scene.ground]

@@ -12,7 +12,7 @@ from matplotlib.patches import Patch, Rectangle
 from numpy.typing import NDArray
 
 from mpmopt.scene import Actuator, Design, Region, Scene, Solid
-from mpmopt.view.draw import draw_walls, new_figure, own_style, set_view
+from mpmopt.view.draw import LAYER, draw_walls, new_figure, own_style, set_view
 
 FACES: dict[type[Region], str] = {Design: "0.93", Actuator: "#f2b8ad", Solid: "0.55"}
 HATCHES: dict[type[Region], str] = {Design: "..", Actuator: "xx", Solid: ""}
@@ -55,6 +55,8 @@ def schematic(scene: Scene) -> Figure:
         Patch(facecolor=FACES[kind], hatch=HATCHES[kind], edgecolor="0.3", label=kind.kind)
         for kind in kinds
     ]
+    if scene.ground:
+        handles.append(Patch(facecolor=LAYER, edgecolor="0.3", label="layer of the ground"))
     axes.legend(
         handles=[*handles, *axes.lines], ncols=4, loc="upper center", frameon=False,
         bbox_to_anchor=(0.5, -0.08),
