@@ -33,7 +33,18 @@ from mpmopt.errors import DesignError, SceneError, SimulationError
 from mpmopt.kernels import parts
 from mpmopt.optimisation.loop import optimise
 from mpmopt.results import runfile
-from mpmopt.scene import Actuator, Design, Grid, Ground, Material, Mirror, Scene, Solid
+from mpmopt.scene import (
+    Actuator,
+    Clamp,
+    Design,
+    Grid,
+    Ground,
+    Material,
+    Mirror,
+    Scene,
+    Solid,
+    Wall,
+)
 from mpmopt.view import gait
 from mpmopt.view.gait import plot_robustness
 
@@ -155,6 +166,8 @@ def test_scenes_are_what_their_names_say():
     with pytest.raises(SceneError, match="no whole number"):
         with_cells(on_ground(grid=Grid((17, 16), C)), 0.5)
     assert not can_be_studied(small_scene())
+    still = tuple(region for region in scene.body if not isinstance(region, Actuator))
+    assert can_be_studied(scene) and not can_be_studied(dataclasses.replace(scene, body=still))
 
 
 def test_a_robot_that_goes_to_the_left_has_room_there():
@@ -174,6 +187,13 @@ def test_a_robot_that_goes_to_the_left_has_room_there():
         ), 0.1,
     )  # fmt: skip
     assert (mirrored.mirror, mirrored.grid.cells) == (Mirror("x", 5 * C), (16, 64))
+    walls, hand = (Wall("x", 2 * C), Wall("y", 4 * C)), Clamp((3 * C, 5 * C), (4 * C, 6 * C))
+    held = small_scene(direction=(-1.0, 0.0), walls=walls, clamps=(hand,))
+    longer = lasting(held, 0.1)
+    way = longer.body[0].lower[0] - held.body[0].lower[0]
+    assert way > 0.5
+    assert [wall.position for wall in longer.walls] == [2 * C + way, 4 * C]
+    assert longer.clamps[0].lower == (3 * C + way, 5 * C)
 
 
 def test_a_robot_is_in_one_piece_and_the_same_on_other_cells():
