@@ -145,7 +145,7 @@ def lasting(scene: Scene, seconds: float) -> Scene:
 
 
 def _moved(scene: Scene, dx: float, dy: float) -> dict[str, Any]:
-    """What of a scene has a place, all of it moved."""
+    """What of a scene has a place, all of it moved; along a plane of symmetry, which stays."""
 
     def at(point: tuple[float, float]) -> tuple[float, float]:
         return point[0] + dx, point[1] + dy
@@ -153,15 +153,13 @@ def _moved(scene: Scene, dx: float, dy: float) -> dict[str, Any]:
     def boxes(items: tuple[Any, ...]) -> tuple[Any, ...]:
         return tuple(replace(each, lower=at(each.lower), upper=at(each.upper)) for each in items)
 
-    def planes(items: tuple[Any, ...]) -> tuple[Any, ...]:
-        along = {"x": dx, "y": dy}
-        return tuple(replace(each, position=each.position + along[each.axis]) for each in items)
-
+    along = {"x": dx, "y": dy}
     return {
         "body": boxes(scene.body),
         "clamps": boxes(scene.clamps),
-        "walls": planes(scene.walls),
-        "mirror": scene.mirror and planes((scene.mirror,))[0],
+        "walls": tuple(
+            replace(wall, position=wall.position + along[wall.axis]) for wall in scene.walls
+        ),
         "ground": tuple(replace(each, points=tuple(map(at, each.points))) for each in scene.ground),
     }
 
