@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -45,6 +46,7 @@ from mpmopt.scene import (
     Solid,
     Wall,
 )
+from mpmopt.scene.particles import discretise
 from mpmopt.view import gait
 from mpmopt.view.gait import plot_robustness
 
@@ -71,7 +73,7 @@ def robot_in(scene: Scene) -> Robot:
 @pytest.fixture
 def soon(monkeypatch):
     """Speeds are seen after hundredths of a unit of time."""
-    for name, time in (("SETTLED", 0.02), ("SEEN", 0.16), ("PUSHED", 0.02), ("RECOVERED", 0.024)):
+    for name, time in (("SETTLED", 0.02), ("SEEN", 0.16), ("PUSHED", 0.02), ("RECOVERED", 0.03)):
         monkeypatch.setattr(robustness, name, time)
 
 
@@ -113,8 +115,8 @@ def test_a_speed_is_the_way_over_the_time_in_whole_periods(formulation, soon):
     assert speed(robot, Trial(lambda: scene)) == pytest.approx(g * (0.02 + end) / 2, rel=0.02)
     pushed = speed(robot, Trial(lambda: scene, pushed=True))
     back = robustness.PUSH * scene.wave_speed
-    later = whole_periods(robot.period(scene), 0.024, 0.16)
-    assert pushed == pytest.approx(g * (0.024 + later) / 2 - back, rel=0.02)
+    later = whole_periods(robot.period(scene), 0.03, 0.16)
+    assert pushed + back == pytest.approx(g * (0.03 + later) / 2, rel=0.02)
     with pytest.raises(SceneError, match="particles times steps"):
         speed(robot, Trial(lambda: scene), most_work=100.0)
     quick = dataclasses.replace(scene, steps=1500, transient=2.0)
@@ -150,6 +152,7 @@ def test_scenes_are_what_their_names_say():
     viscous = dataclasses.replace(
         scene, material=dataclasses.replace(scene.material, viscosity=0.1)
     )
+    assert with_cells(on_ground(filter_length=3 * C), 2.0).filter_length == 0.0
     assert with_cells(viscous, 4.0).time_step == 5e-4  # a quarter would be too long there
     assert [ground.friction for ground in Variation(friction=0.7).scene(scene).ground] == [0.7]
     strong = with_frequency(Variation(strength=1.2).scene(scene), 0.8).actuators
@@ -362,6 +365,71 @@ def test_a_robot_is_followed_until_it_falls_or_stops(monkeypatch, end, way, heig
     if way(1.0) < 0.0:
         wanted = robustness.SETTLED
     assert found.seconds == pytest.approx(wanted, abs=0.3)
+
+
+def test_a_robot_is_tracked_by_what_is_not_designed_above_the_nearest_ground():
+    ceiling = Ground(((1.0, 12 * C), (0.0, 12 * C)), thickness=C)
+    scene = on_ground(ground=(Ground.floor(3 * C, thickness=C), ceiling))
+    particles = discretise(scene)
+    state = robot_in(scene).body(scene).initial.copy()
+    assert state.shape[1] == len(particles.position)
+    F = parts(state).deformation
+    for angle, which in ((0.3, ~particles.designed), (1.5, particles.designed)):
+        turn = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+        F[:, :, which] = np.array(turn)[:, :, None]
+    above = state.copy()
+    parts(above).position[1] += 4 * C
+    centre = particles.position[~particles.designed].mean(axis=0)
+    way, height, lean = robustness.track(scene, particles, [state, above])
+    assert way == pytest.approx([centre[0], centre[0]])
+    assert height == pytest.approx([centre[1] - 3 * C, 8 * C - centre[1]])
+    assert lean == pytest.approx([0.3, 0.3])
+
+
+def test_twice_the_step_is_tried_where_it_is_stable():
+    for scene in (on_ground(), on_ground(time_step=on_ground().largest_time_step)):
+        stable = 2.0 * scene.time_step <= scene.largest_time_step
+        assert ("step 2" in robustness._trials(scene, full=True)) is stable
+
+
+@pytest.mark.parametrize("stops, end", [(6.0, "stops"), (9.0, "it burst")])
+def test_what_a_robot_did_before_it_failed_counts(monkeypatch, stops, end):
+    scene = small_scene(
+        body=(Solid((4 * C, 4 * C), (6 * C, 8 * C)),), walls=(), gravity=(0.0, 0.0),
+        direction=(0.0, 1.0), mirror=Mirror("x", 5 * C),
+    )  # fmt: skip
+    burst = round(9.5 / scene.time_step)
+
+    def run(frames):
+        if frames[-1] >= burst:
+            raise SimulationError("it burst", burst, -1, (0.0, 0.0), "none")
+        return np.array(frames) * scene.time_step
+
+    def track(scene, particles, t):
+        return 0.1 * np.minimum(t, stops), np.ones_like(t), np.ones_like(t)  # half of it leans
+
+    monkeypatch.setattr(robustness, "track", track)
+    body = SimpleNamespace(run=run, particles=None)
+    robot: Any = SimpleNamespace(body=lambda scene: body, period=lambda scene: 0.2)
+    found = follow(robot, scene)
+    assert found.end == end
+    assert found.seconds == pytest.approx(6.0 if end == "stops" else 9.5, abs=0.3)
+
+
+def test_a_full_study_may_take_longer(told, monkeypatch):
+    told(TOLD)
+    allowed: set[float] = set()
+
+    def one(robot, trial, most):
+        allowed.add(most)
+        return 0.1
+
+    monkeypatch.setattr(robustness, "speed", one)
+    study_of(on_ground(), full=False)
+    assert allowed == {robustness.MOST_WORK}
+    allowed.clear()
+    study_of(on_ground(), full=True)
+    assert allowed == {robustness.MOST_WORK_FULL}
 
 
 def test_a_robot_that_cannot_be_simulated_was_followed_until_then(monkeypatch):
