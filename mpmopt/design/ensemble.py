@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import reduce
@@ -12,6 +11,7 @@ import numpy as np
 
 from mpmopt.design.evaluation import Evaluation
 from mpmopt.design.task import Task
+from mpmopt.simulation.threads import processors
 
 Scene = TypeVar("Scene")
 Result = TypeVar("Result")
@@ -27,9 +27,7 @@ def side_by_side(function: Callable[[Scene], Result], scenes: Sequence[Scene]) -
     Exception
         What the function of the first scene that fails raises.
     """
-    allowed = getattr(os, "sched_getaffinity", None)  # not on macOS
-    processors = len(allowed(0)) if allowed else os.cpu_count() or 1
-    workers = min(len(scenes), processors)
+    workers = min(len(scenes), processors())
     if workers == 1:
         return [function(scene) for scene in scenes]
     with ThreadPoolExecutor(workers) as pool:

@@ -101,6 +101,21 @@ def plain(kernel: Any) -> Any:
     return getattr(kernel, "py_func", kernel)
 
 
+def types_of(kernel: Any, arguments: tuple[Any, ...]) -> tuple[Any, ...]:
+    """Numba's types of a loop's arguments."""
+    return tuple(map(kernel.typeof_pyval, arguments))
+
+
+def is_to_compile(kernel: Any, arguments: tuple[Any, ...]) -> bool:
+    """Whether a call would compile a loop, and keep it on disk."""
+    file = getattr(getattr(kernel, "_cache", None), "_cache_file", None)
+    if file is None:
+        return False
+    types = types_of(kernel, arguments)
+    key = kernel._cache._index_key(types, kernel.targetctx.codegen())
+    return types not in kernel.overloads and key not in file._load_index()
+
+
 def _stamped(kernel: Any) -> Any:
     file = getattr(getattr(kernel, "_cache", None), "_cache_file", None)
     if file is not None:  # the compiler and its cache are on

@@ -11,8 +11,9 @@ from numpy.typing import DTypeLike, NDArray
 from mpmopt import kernels
 from mpmopt.errors import SimulationError, StorageError
 from mpmopt.scene.checks import MOST_NUMBERS
+from mpmopt.simulation.ahead import Round, compile_in_two
 from mpmopt.simulation.checkpoints import Checkpoints
-from mpmopt.simulation.threads import in_parallel
+from mpmopt.simulation.threads import MEETING, in_parallel
 
 if TYPE_CHECKING:
     from mpmopt.simulation.simulation import Simulation
@@ -97,6 +98,8 @@ class Segment:
 
     def advance(self, first: int, last: int) -> None:
         """Advance from step `first`, whose state is in slot 0, to step `last`."""
+        if self.states.dtype == float:
+            compile_in_two("particles", self._loops)
         simulation = self.simulation
         signal = simulation.signal[first:last]
         parameters = simulation.parameters_of_steps(first, last)
@@ -127,6 +130,25 @@ class Segment:
                 particle = min(particle, simulation.initial.shape[1] - 1)
                 state = self.state(reached % len(self.states))
                 raise _failure(simulation, end, first + reached, particle, state)
+
+    def _loops(self) -> list[Round]:
+        """The loops of a run and of its way back, in halves that take as long to compile."""
+        simulation, states = self.simulation, self.states
+        data, parameters, signal = simulation.data, simulation.parameters, simulation.signal
+        run = states, self.grids, self.windows, self.logs, 0, 0, data, parameters, signal
+        meeting = np.empty(MEETING, np.int64), 0, 1
+        bars = states[0], kernels.ParticleDataBar.zeros(len(data.mass), float), signal[None]
+        seen = states[0], simulation._reference, simulation._solid, data, parameters
+        return [
+            (
+                [(kernels.advance, (*run, self.scratch, *meeting))],
+                [
+                    (kernels.closest, seen),
+                    (kernels.indicators, (states[0], data, parameters, 0, 0)),
+                    (kernels.advance_adjoint, (*run, self.scratch, *bars, *meeting)),
+                ],
+            )
+        ]
 
     def advance_adjoint(
         self,

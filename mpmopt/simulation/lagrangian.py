@@ -13,6 +13,7 @@ from mpmopt import kernels
 from mpmopt.errors import DesignError, SimulationError
 from mpmopt.kernels import lagrangian, lattice_indicators, pairs
 from mpmopt.scene.parts import Vector
+from mpmopt.simulation.ahead import Round, compile_in_two
 from mpmopt.simulation.buffers import Memory
 from mpmopt.simulation.checkpoints import Checkpointing, Checkpoints, Schedule
 from mpmopt.simulation.energy import LOOK
@@ -323,6 +324,8 @@ class NodeSegment:
 
     def advance(self, first: int, last: int) -> None:
         """As `Segment.advance`."""
+        if self.states.dtype == float:
+            compile_in_two("lattice", self._loops)
         simulation = self.simulation
         clamps = simulation.parameters.clamps[first:]
         lattice = simulation.lattice._replace(clamps=clamps)
@@ -340,6 +343,43 @@ class NodeSegment:
                     "density or weaker actuation",
                 )  # fmt: skip
             step = stop
+
+    def _loops(self) -> list[Round]:
+        """The loops of a run and of its way back, in halves that take as long to compile."""
+        simulation, states, x = self.simulation, self.states, self.states[0]
+        lattice, signal, number = simulation.lattice, simulation.signal, simulation._number
+        inner, bar = lattice._replace(touch=0), lagrangian.LatticeBar.zeros(lattice)
+        rows = lagrangian.Rows(*(np.empty((0,) * axes) for axes in (2, 2, 4)))
+        near, groups = kernels.plain(pairs.nowhere)(lattice.touch), lattice.filled
+        body = simulation._reference, simulation._solid, simulation.data, simulation.parameters
+        look = states, np.empty(0, np.int64), lattice, number, *body, np.empty((0, 5))
+        run = states, 0, 0, lattice, signal
+        return [
+            (
+                [
+                    (lattice_indicators.look, look),
+                    (lagrangian.particles, (x, lattice, number, x)),
+                    (lagrangian.forces, (x, inner, signal[0], rows, x)),
+                    (lagrangian.press, (x, inner, groups, rows, x)),
+                ],
+                [(pairs.renewed, (near, x, lattice.touch))],
+            ),
+            (
+                [
+                    (lagrangian.forces_adjoint, (x, x, inner, signal[0], rows, x, bar, signal[0])),
+                    (lagrangian.press_adjoint, (x, x, inner, groups, rows, x, bar)),
+                ],
+                [
+                    (lagrangian.move, (x, x, x, inner.mass, inner)),
+                    (lagrangian.move_adjoint, (x, x, x, inner.mass, inner, x, x, bar)),
+                    (pairs.push_apart_adjoint, (near, x, lattice.touch, x, x, bar.grip)),
+                ],
+            ),
+            (
+                [(lagrangian.advance_lattice, run)],
+                [(lagrangian.advance_lattice_adjoint, (*run, x, bar, signal))],
+            ),
+        ]
 
     def advance_adjoint(
         self,

@@ -40,6 +40,12 @@ def threads() -> int:
     return int(wish or 1)
 
 
+def processors() -> int:
+    """Processors that this process may use."""
+    allowed = getattr(os, "sched_getaffinity", None)  # not on macOS
+    return len(allowed(0)) if allowed else os.cpu_count() or 1
+
+
 def in_parallel(most: int, loop: Callable[..., Any], *arguments: Any) -> Any:
     """Call ``loop(*arguments, meeting, thread, threads)`` in several threads, `most` at most.
 
