@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import results
 import robots
 import spread
 from conftest import SHORT, small_scene
@@ -168,3 +169,32 @@ def test_a_stride_is_one_period_and_a_gait_has_its_feet(tmp_path, monkeypatch):
     assert time[0] == 0.0
     assert 0.09 < time[-1] <= 0.1
     assert "centroid" in [text.get_text() for text in place.get_legend().get_texts()]
+
+
+def test_the_page_of_results_is_made_of_what_its_command_leaves(tmp_path):
+    scripts = [Path(command[0]) for command in results.commands(tmp_path)]
+    assert all(script.is_file() for script in scripts if script != Path("-m"))
+    named = " ".join(" ".join(command) for command in results.commands(tmp_path))
+    for source, page in results.PAGES.items():
+        assert (results.ROOT / page).is_file()
+        assert str(tmp_path / source.partition("/")[0]) in named
+    read = (results.ROOT / "docs" / "results.rst").read_text()
+    read += (results.ROOT / "README.md").read_text()
+    assert all(page.removeprefix("docs/") in read for page in results.PAGES.values())
+
+
+def test_the_page_of_results_is_copied_once_all_is_there(tmp_path, monkeypatch):
+    monkeypatch.setattr(results, "ROOT", tmp_path)
+    monkeypatch.setattr(results, "commands", lambda out: iter([["-c", "import sys; sys.exit(3)"]]))
+    out = tmp_path / "out"
+    assert results.main(["--out", str(out), "--docs"]) == 3
+    monkeypatch.setattr(results, "commands", lambda out: iter([["-c", "pass"]]))
+    for source, page in results.PAGES.items():
+        for place in (out / source, tmp_path / page):
+            place.parent.mkdir(parents=True, exist_ok=True)
+        (out / source).write_text(source)
+    assert results.main(["--out", str(out)]) == 0
+    assert not any((tmp_path / page).exists() for page in results.PAGES.values())
+    assert results.main(["--out", str(out), "--docs"]) == 0
+    for source, page in results.PAGES.items():
+        assert (tmp_path / page).read_text() == source
