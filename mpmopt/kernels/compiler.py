@@ -107,13 +107,13 @@ def types_of(kernel: Any, arguments: tuple[Any, ...]) -> tuple[Any, ...]:
 
 
 def is_to_compile(kernel: Any, arguments: tuple[Any, ...]) -> bool:
-    """Whether a call would compile a loop, and keep it on disk."""
-    file = getattr(getattr(kernel, "_cache", None), "_cache_file", None)
-    if file is None:
+    """Whether a call would compile a loop, and keep it on disk; no where Numba does not tell."""
+    try:
+        file, types = kernel._cache._cache_file, types_of(kernel, arguments)
+        key = kernel._cache._index_key(types, kernel.targetctx.codegen())
+        return types not in kernel.overloads and key not in file._load_index()
+    except (AttributeError, TypeError, OSError):  # not compiled, not cached, or another Numba's
         return False
-    types = types_of(kernel, arguments)
-    key = kernel._cache._index_key(types, kernel.targetctx.codegen())
-    return types not in kernel.overloads and key not in file._load_index()
 
 
 def _stamped(kernel: Any) -> Any:

@@ -98,7 +98,7 @@ class Segment:
 
     def advance(self, first: int, last: int) -> None:
         """Advance from step `first`, whose state is in slot 0, to step `last`."""
-        if self.states.dtype == float:
+        if first < last and self.states.dtype == float:
             compile_in_two("particles", self._loops)
         simulation = self.simulation
         signal = simulation.signal[first:last]

@@ -324,7 +324,7 @@ class NodeSegment:
 
     def advance(self, first: int, last: int) -> None:
         """As `Segment.advance`."""
-        if self.states.dtype == float:
+        if first < last and self.states.dtype == float:
             compile_in_two("lattice", self._loops)
         simulation = self.simulation
         clamps = simulation.parameters.clamps[first:]
