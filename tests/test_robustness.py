@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from conftest import SHORT, empty, small_scene
 
+from mpmopt.app import ending
 from mpmopt.app.study import full_study
 from mpmopt.app.summary import table
 from mpmopt.assess import robustness
@@ -28,6 +29,7 @@ from mpmopt.assess.robustness import (
     with_frequency,
 )
 from mpmopt.assess.threshold import kept
+from mpmopt.assess.verdict import verdict
 from mpmopt.design.problem import Problem
 from mpmopt.design.variation import Variation
 from mpmopt.errors import DesignError, SceneError, SimulationError
@@ -276,7 +278,7 @@ def test_a_study_tells_speeds_and_shares(told):
     assert found["kept"] == pytest.approx(
         {"half_step": 0.9, "finer_cells": 0.8, "finest_cells": 0.6, "other_formulation": 0.5}
     )
-    assert (found["speed"], found["components"]) == (0.1, 1)
+    assert (found["speed"], found["way"], found["components"]) == (0.1, "goes", 1)
     assert (found["driven_share"], found["after_push"]) == pytest.approx((0.8, 0.7))
     assert found["speed_by_strength"] == {"0.8": -0.01, "1": 0.1, "1.2": None}
     assert found["speed_by_cells"] == {
@@ -313,14 +315,17 @@ def test_a_run_on_other_cells_that_fails_is_made_again_with_half_its_step(monkey
 
 
 def test_no_share_of_a_robot_that_stays_where_it_is(told):
-    for nominal in (1e-4, -0.1, None):
+    ways = ((1e-4, "stands"), (-1e-4, "stands"), (-0.1, "goes back"), (None, None))
+    for nominal, way in ways:
         rest = {name: value for name, value in TOLD.items() if name != "nominal"}
         told(rest if nominal is None else {**rest, "nominal": nominal})
         found = study_of(on_ground())
-        assert found["speed"] == nominal
+        assert (found["speed"], found["way"]) == (nominal, way)
         if nominal is not None:
-            back = found["failures"]["shares"].startswith("the robot goes back")
-            assert back is (nominal < 0.0)
+            assert found["failures"]["shares"].startswith(f"the robot {way}: ")
+            said = verdict({**found, "post_processed": 0.6, "retained_gain": {}})
+            assert said.startswith(f"{way}: its speed along the way is {nominal:.3f}")
+            assert f"; it {way}; " in ending._elsewhere(found)["speed"]
         assert {*found["kept"].values(), found["driven_share"], found["after_push"]} == {None}
 
 

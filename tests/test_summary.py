@@ -322,19 +322,20 @@ def test_the_presets_are_what_they_say():
 def test_the_table_at_the_end_says_what_a_number_is_of():
     summary = {
         "disconnected_particles": 6, "components": 2, "speed": 1e-4, "driven_share": None,
-        "speed_by_friction": {}, "failures": {"shares": "the robot stands"},
+        "speed_by_friction": {}, "failures": {}, "way": "stands",
     }  # fmt: skip
     assert "they count in displacement, not in speed" in ending._pieces(summary)
     assert "it stands" in ending._elsewhere(summary)["speed"]
-    back = {**summary, "speed": -0.3}
+    back = {**summary, "speed": -0.3, "way": "goes back"}
     assert "it goes back" in ending._elsewhere(back)["speed"]
-    moved = {**summary, "failures": {}, "followed": {"end": "falls", "seconds": 9.06}}
+    moved = {**summary, "way": "goes", "followed": {"end": "falls", "seconds": 9.06}}
     assert "at 9.06: falls" in ending._elsewhere(moved)["speed"]
 
 
 WALKER = {
-    "speed": 0.1, "post_processed": 0.6, "disconnected_particles": 0, "gain": {"as designed": 0.2},
-    "driven_share": 1.0, "kept": {"half_step": 0.97, "finer_cells": 0.9}, "failures": {},
+    "speed": 0.1, "way": "goes", "post_processed": 0.6, "disconnected_particles": 0,
+    "gain": {"as designed": 0.2}, "driven_share": 1.0, "failures": {},
+    "kept": {"half_step": 0.97, "finer_cells": 0.9},
 }  # fmt: skip
 FINGER = {
     "post_processed": 0.6, "disconnected_particles": 0, "gain": {"as designed": 0.2},
@@ -351,10 +352,11 @@ FINGER = {
         (WALKER, {"followed": {"end": "stops", "seconds": 9.06}}, "stops: at t = 9.06"),
         (WALKER, {"followed": {"end": "it tore", "seconds": 9.0}}, "fails: at t = 9.00, it tore"),
         (WALKER, {"speed": None, "failures": {"nominal": "it tore"}}, "fails: it tore"),
-        (WALKER, {"speed": 1e-4, "failures": {"shares": "too slow"}}, "stands: .* 0.000100"),
+        (WALKER, {"speed": 1e-4, "way": "stands"}, "stands: .* 0.000100"),
+        (WALKER, {"speed": -1e-4, "way": "stands"}, "stands: .* -0.000100"),
         (
             WALKER,
-            {"speed": -0.3, "failures": {"shares": "too slow"}},
+            {"speed": -0.3, "way": "goes back"},
             r"goes back: its speed along the way is -0\.300$",
         ),
         (WALKER, {"driven_share": DRIVEN - 0.01}, "slides: only 49%"),
@@ -406,7 +408,7 @@ def test_a_run_has_a_verdict_in_one_word(whole, changes, says):
 
 def test_what_is_not_to_travel_is_judged_by_its_gain():
     jumper = {
-        **WALKER, **FINGER, "speed": 1e-4, "driven_share": None, "failures": {"shares": "slow"},
+        **WALKER, **FINGER, "speed": 1e-4, "driven_share": None, "way": "stands",
         "followed": {"end": "falls", "seconds": 3.0},
     }  # fmt: skip
     assert verdict(jumper).startswith("stands")

@@ -93,9 +93,8 @@ def _elsewhere(summary: Mapping[str, Any]) -> dict[str, str]:
     speed = f"{_shown(summary['speed'])} after the transient{share}"
     followed = summary.get("followed") or {"end": "goes on"}
     end = followed["end"]
-    slow = ""
-    if "shares" in summary.get("failures", {}):
-        slow = "; it goes back" if summary["speed"] < 0.0 else "; it stands"
+    way = summary.get("way") or "goes"
+    slow = "" if way == "goes" else f"; it {way}"
     went = slow if end == "goes on" else f"; at {digits(followed['seconds'], 3)}: {end}"
     return {"speed": f"{speed}{went}; by friction: {by_friction}"}
 

@@ -56,7 +56,7 @@ LEANS, LOW, SLOW, PAUSE = math.radians(45.0), 0.5, 0.1, 2.0
 LEAST = 2e-3
 # What `study` tells, of what there is.
 NAMES = (
-    "speed", "speed_by_friction", "kept", "driven_share", "after_push", "speed_by_strength",
+    "speed", "way", "speed_by_friction", "kept", "driven_share", "after_push", "speed_by_strength",
     "speed_by_frequency", "speed_by_step", "speed_by_cells", "followed", "components",
 )  # fmt: skip
 # The trials whose share of the speed `study` tells as ``kept``.
@@ -169,9 +169,8 @@ def with_cells(
 ) -> Scene:
     """The scene with so many times its cells along each axis, and in another formulation.
 
-    The step is as much shorter as cells are narrower (`variation.refined` leaves it at that, so
-    that only cells differ), and shorter still where viscosity or a layer need that. It has no
-    design filter, which no solid body needs.
+    The step is as much shorter as cells are narrower, and shorter still where viscosity or a layer
+    need that. It has no design filter, which no solid body needs.
 
     Raises
     ------
@@ -381,7 +380,8 @@ def study(
     Returns
     -------
     dict
-        ``speed``; ``speed_by_friction``, and where it is full ``speed_by_strength``,
+        ``speed``; ``way``: "goes", "goes back" or "stands", which have no shares, or None where
+        there is no speed; ``speed_by_friction``, and where it is full ``speed_by_strength``,
         ``speed_by_frequency``, ``speed_by_step`` (times the run's, as far as it is stable) and, of
         both formulations, ``speed_by_cells`` (along the grid's shorter side), by numbers as text;
         ``kept``, shares of the speed with half the step, with cells half as wide, and where it is
@@ -408,13 +408,17 @@ def study(
         speeds[f"{kind} 1"] = nominal
 
     least = LEAST * max(scene.extent)
-    if nominal is not None and not nominal > least:
-        why = "the robot goes back" if nominal < 0.0 else "the robot stands"
-        failures["shares"] = f"{why}: a speed of less than {least:.2g} has no shares"
+    way = None
+    if nominal is not None:
+        way = "goes" if nominal > least else "goes back" if nominal < -least else "stands"
+    if way == "stands":
+        failures["shares"] = f"the robot stands: no speed within {least:.2g} of zero has shares"
+    elif way == "goes back":
+        failures["shares"] = "the robot goes back: a speed against its direction has no shares"
 
     def share(name: str) -> float | None:
         value = speeds[name]
-        if value is None or nominal is None or not nominal > least:
+        if value is None or nominal is None or way != "goes":
             return None
         return value / nominal
 
@@ -427,6 +431,7 @@ def study(
     still = share("frozen")
     found |= {
         "speed": nominal,
+        "way": way,
         "speed_by_friction": table("friction"),
         "kept": kept,
         "driven_share": None if still is None else 1.0 - still,

@@ -52,9 +52,9 @@ def verdict(summary: Mapping[str, Any], missed: Sequence[str] = (), travels: boo
         return f"fails: {failures.get('nominal', 'it cannot be simulated without its void')}"
     if missed:
         return f"breaks a constraint: {'; '.join(missed)}"
-    if studied and "shares" in failures:
-        word = "goes back" if value < 0.0 else "stands"
-        return f"{word}: its speed along the way is {digits(value, 3)}"
+    way = summary.get("way", "goes")
+    if studied and way != "goes":
+        return f"{way}: its speed along the way is {digits(value, 3)}"
     if followed and followed["end"] in ("falls", "stops"):
         return f"{followed['end']}: at t = {digits(followed['seconds'], 3)}"
     if followed and followed["end"] != "goes on":
