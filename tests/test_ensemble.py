@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from conftest import worst
 
+from mpmopt.app.summary import summarise
+from mpmopt.assess import refinement, robustness, threshold
 from mpmopt.assess.threshold import distance, kept
 from mpmopt.assess.verify import complex_step_test
 from mpmopt.design.problem import Problem
@@ -210,8 +212,8 @@ def test_a_late_stage_has_finer_cells_and_the_robot_is_of_it(x, tmp_path):
     early, _ = settings.stages
     assert early == last
     run = optimise(SCENE, settings, x, task=dataclasses.replace(TASK, subject_to=()))
-    for item, refinement in zip(run.history, (1, 2), strict=True):
-        varied = (dataclasses.replace(TASK.scenes[k], refinement=refinement) for k in (0, 2))
+    for item, times in zip(run.history, (1, 2), strict=True):
+        varied = (dataclasses.replace(TASK.scenes[k], refinement=times) for k in (0, 2))
         first, third = varied
         scenes = first, TASK.scenes[1], third
         there = early.problem(SCENE, task=dataclasses.replace(run.task, scenes=scenes))
@@ -224,9 +226,33 @@ def test_a_late_stage_has_finer_cells_and_the_robot_is_of_it(x, tmp_path):
     assert read_run(tmp_path / "run.h5").run.settings == settings
 
 
+def test_a_summary_compares_in_the_scenes_of_the_best_designs_stage(x, monkeypatch):
+    """The block, the baseline and the body without grey: all on the finer cells."""
+    asked = []
+
+    def distance(scene, keep, variables, task):
+        asked.append([each.refinement for each in task.scenes])
+        return 0.1
+
+    for module in (threshold, refinement):
+        monkeypatch.setattr(module, "distance", distance)
+    monkeypatch.setattr(robustness, "study", lambda *_: {})
+    stage = Stage(4.0, 1e-2, 1e-2, 2e-3, finer=(0, 2), solid=True, most_iterations=1)
+    run = optimise(SCENE, Settings((stage,)), x, task=dataclasses.replace(TASK, subject_to=()))
+    asked.clear()
+    block = summarise(run, np.ones(len(run.result.gamma), dtype=bool))
+    assert (block["reference"], block["baseline"]) == (0.1, 0.1)
+    assert len(asked) > 8
+    assert all(each == [2, 1, 2] for each in asked)
+
+
 def test_finer_scenes_are_scenes_of_the_task():
     settings = Settings((Stage(2.0, finer=(3,)),))
-    with pytest.raises(DesignError, match=r"finer = \(3,\) names scene 3, the task has 3"):
+    with pytest.raises(DesignError, match=r"\(3,\) names scene 3, the task has scenes 0 to 2"):
         begin(SCENE, settings, {}, TASK)
+    with pytest.raises(DesignError, match="give the task scenes"):
+        begin(SCENE, settings, {}, Task())
+    with pytest.raises(DesignError, match=r"finer = \(0, 1, 0\) names scene 0 twice; name it once"):
+        Stage(2.0, finer=(0, 1, 0))
     with pytest.raises(DesignError, match="finer = -1"):
         Stage(2.0, finer=(-1,))

@@ -37,7 +37,7 @@ class Variation(Checked):
         Of the projection, between 0 and 1: above 1/2 the design is eroded, below it dilated (Wang,
         Lazarov and Sigmund, 2011).
     refinement : int, optional
-        How many cells take the place of one along each axis, at the same Courant number.
+        How many cells take the place of one along each axis (`refined`).
     formulation : {"updated", "total"}, optional
         Instead of the scene's.
 
@@ -132,10 +132,10 @@ class Variation(Checked):
 
 
 def refined(scene: Scene, times: int) -> Scene:
-    """The scene with so many cells in place of one along each axis, at the same Courant number.
+    """The scene with so many cells in place of one along each axis, and a step as much shorter.
 
-    The step is shorter still where viscosity needs that, which bounds it by the square of the
-    cells' width. It has no design filter: its design comes from the other lattice.
+    It is shorter still where viscosity needs that, which bounds it by the square of the cells'
+    width. It has no design filter: its design comes from the other lattice.
     """
     if times == 1:
         return scene

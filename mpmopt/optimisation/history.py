@@ -203,10 +203,10 @@ class Optimisation:
     def result(self) -> Candidate:
         """The best evaluation.
 
-        That is the one that counts most (`Candidate.counted`), where stages ask for bodies without
-        void, and of refined and of finer stages where there are some; else the best of the last
-        stage that had one, whose projection is the sharpest. Those that meet the constraints come
-        first.
+        That is, of the best of each stage, the one that goes farthest without void, but one of a
+        stage with finer scenes comes before all others, and one of a refined stage before the
+        rest, however far those go; without void none may count, then it is that of the last stage.
+        Those that meet the constraints come first.
 
         Raises
         ------
@@ -220,8 +220,8 @@ class Optimisation:
 
         def merit(item: Candidate) -> tuple[float, int, float, int]:
             stage = stages[item.stage]
-            finer = 2 * bool(stage.finer) + stage.refined if np.isfinite(item.counted) else 0
-            return -item.violation, finer, item.counted, item.stage
+            rank = 2 * bool(stage.finer) + stage.refined if np.isfinite(item.counted) else 0
+            return -item.violation, rank, item.counted, item.stage
 
         return max(self.best.values(), key=merit)
 

@@ -65,8 +65,10 @@ def gait(most_iterations: int, move_limit: float = 0.02) -> Settings:
 def then_finer(settings: Settings, scenes: tuple[int, ...], most_iterations: int) -> Settings:
     """The same, and a stage like its last one in which some of the task's scenes are finer.
 
-    For robots that lose speed on finer cells: from a finished one it mends that, from the start it
-    finds slower ones. Designs are not refined once more there.
+    So that the robot keeps its speed on finer cells: from a finished one it mends that, from the
+    start it finds slower ones. The stage begins at the design that went farthest as it is, and its
+    best design is the run's, whatever earlier ones reach on wide cells (`Optimisation.result`).
+    Designs are not refined once more there.
     """
     *_, last = settings.stages
     late = replace(last, refined=False, finer=scenes, most_iterations=most_iterations)

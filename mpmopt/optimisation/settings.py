@@ -55,7 +55,7 @@ class Stage(Checked):
         This costs four gradients more for each design that goes farther than the best so far.
     finer : tuple of int
         Numbers, from 0, of the task's scenes that have cells half as wide in this stage: a late
-        stage with one teaches a robot to go on any.
+        stage with one, so that the robot keeps its speed on finer cells.
     move_limit : float
         Greatest step of a variable, as a fraction of its range.
     void_cutoff : float
@@ -104,6 +104,9 @@ class Stage(Checked):
         given: Any = self.finer
         numbers = tuple(given) if isinstance(given, Iterable) else (given,)
         finer = tuple(count("Stage", "finer", k, 0, error=DesignError) for k in numbers)
+        for k in finer:
+            if finer.count(k) > 1:
+                raise DesignError(f"Stage: finer = {finer} names scene {k} twice; name it once")
         object.__setattr__(self, "finer", finer)
         _take(self, count, "most_iterations", least=1)
         _take(self, count, "halvings", least=0)
@@ -128,8 +131,10 @@ class Stage(Checked):
         scenes = list(task.scenes)
         for k in self.finer:
             if k >= len(scenes):
+                there = f"the task has scenes 0 to {len(scenes) - 1}"
                 raise DesignError(
-                    f"Stage: finer = {self.finer} names scene {k}, the task has {len(scenes)}"
+                    f"Stage: finer = {self.finer} names scene {k}, "
+                    f"{there if scenes else 'the task has none: give the task scenes'}"
                 )
             scenes[k] = dataclasses.replace(scenes[k], refinement=2 * scenes[k].refinement)
         return dataclasses.replace(task, scenes=tuple(scenes))
