@@ -14,7 +14,7 @@ from matplotlib import rc_context, rcdefaults
 from matplotlib.axes import Axes
 from matplotlib.backend_bases import RendererBase
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.collections import Collection
+from matplotlib.collections import Collection, PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch, Polygon, Rectangle
 from matplotlib.path import Path as Outline
@@ -109,9 +109,9 @@ def draw_walls(axes: Axes, scene: Scene, moving: bool = False) -> None:
             else ((left, start), right - left, end - start)
         )
         axes.add_patch(Rectangle(corner, width, height, **SOLID))
-    draw_layers(axes, scene)
+    reach = 4.0 * (right - left + high - low)
+    draw_layers(axes, scene, reach)
     for ground in scene.ground:
-        reach = 4.0 * (right - left + high - low)
         for style in (SOLID, OUTLINE):
             axes.add_patch(Polygon(ground_outline(ground, reach), **style))
     for clamp in scene.clamps:
@@ -121,12 +121,18 @@ def draw_walls(axes: Axes, scene: Scene, moving: bool = False) -> None:
         axes.plot(*(way + np.add(clamp.lower, clamp.upper) / 2.0).T, color="C1", lw=0.8)
 
 
-def draw_layers(axes: Axes, scene: Scene) -> None:
-    """Shade where the layers of ground bear, as far as the axes reach now, and the ground too."""
-    places = np.meshgrid(*(np.linspace(*ends, 200) for ends in (axes.get_xlim(), axes.get_ylim())))
-    for layer in scene.layers:
-        d, _ = layer.line.distance(np.array(places))
-        axes.contourf(*places, d, [-math.inf, layer.thickness], colors=LAYER)
+def draw_layers(axes: Axes, scene: Scene, reach: float) -> None:
+    """Shade where the layers of ground bear, as thick as they are on both sides of its points."""
+    angles = np.linspace(0.0, 2.0 * np.pi, 48)
+    for ground, layer in zip(scene.ground, scene.layers, strict=True):
+        disc = layer.thickness * np.array([np.cos(angles), np.sin(angles)]).T
+        way = ground_outline(ground, reach)[: len(ground.points) + 2]
+        along = np.diff(way, axis=0)
+        across = layer.thickness * along[:, ::-1] / np.hypot(*along.T)[:, None] * (-1.0, 1.0)
+        first, last = way[:-1], way[1:]
+        bands = np.stack([first + across, last + across, last - across, first - across], axis=1)
+        corners = [*bands, *(way[1:-1, None] + disc)]
+        axes.add_collection(PolyCollection(corners, facecolor=LAYER, lw=0.0), autolim=False)
 
 
 def ground_outline(ground: Ground, reach: float) -> NDArray[np.float64]:
