@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mpmopt.assess.robustness import FEW_FRICTIONS, Robot, lasting
+from mpmopt.assess.robustness import FEW_FRICTIONS, Robot, lasting, unit
 from mpmopt.assess.trajectory import Motion, equal_steps
 from mpmopt.design.variation import Variation
 from mpmopt.errors import DesignError, SimulationError
@@ -21,7 +21,7 @@ from mpmopt.view.gait import body_of
 
 logger = logging.getLogger(__name__)
 
-SHOWN = 4.0  # of the scene's time
+SHOWN = 4.0  # in units of `unit`
 SECONDS = 10.0  # that the film takes for it
 
 
@@ -57,16 +57,17 @@ def film_scenes(path: Path, run: Optimisation, seconds: float = SECONDS) -> Film
         raise DesignError(f"film: seconds = {seconds!r} must be from {2 / RATE:g} to 600")
     scenes = run.task.scenes or tuple(Variation(friction=value) for value in FEW_FRICTIONS)
     robot, motions = Robot.of(problem, run.result.x), []
+    shown = SHOWN * unit(problem.scene)
     for variation in scenes:
         try:
-            scene = lasting(variation.scene(problem.scene), SHOWN)
+            scene = lasting(variation.scene(problem.scene), shown)
             body = body_of(robot, scene, str(variation))
             motions.append(Motion.of(body, equal_steps(scene, count)))
         except SimulationError as error:
             logger.warning("the film is without the scene of %s: %s", variation, error)
     if not motions:
         raise DesignError("film: the robot cannot be simulated in any of its scenes")
-    screen = Screen(motions, seconds / SHOWN)
+    screen = Screen(motions, seconds / shown)
     with Progress("frames", count) as progress:
 
         def frames() -> Iterator[NDArray[np.uint8]]:
@@ -76,5 +77,5 @@ def film_scenes(path: Path, run: Optimisation, seconds: float = SECONDS) -> Film
 
         content = encoded(path, frames())
     replace_file(path, content)
-    per_period = count * robot.period(problem.scene) / SHOWN
-    return Filmed(count, seconds + LAST, seconds / SHOWN, per_period, len(content))
+    per_period = count * robot.period(problem.scene) / shown
+    return Filmed(count, seconds + LAST, seconds / shown, per_period, len(content))
