@@ -74,7 +74,7 @@ def test_displacements_count_from_where_the_body_was(page, short_run):
     data = data_of(page)
     start = 5 / 16  # the middle of solid and actuators
     assert short_run.origin == pytest.approx(start)
-    assert data["tables"]["travel"]["without grey"] == pytest.approx(0.4 - start)
+    assert data["tables"]["placed"]["without grey"] == pytest.approx(0.4 - start)
     wanted = [item.objective - start for item in short_run.history]
     assert data["history"]["objective"] == pytest.approx(wanted, rel=1e-4)
     assert data["tables"]["retained"]["half the step"] == {"gain": None, "retained": None}

@@ -211,8 +211,8 @@ def moving(
 ) -> Iterator[tuple[Body, Motion]]:
     """A design's bodies and how they move, one after the other.
 
-    Where one fails its step is halved, as often as the problem's evaluations may: they had other
-    scenes, or another body. One that fails all the same is left out, which a warning tells.
+    Where one fails its step is halved, up to `Problem.halvings` times, since no evaluation has
+    simulated this body. One that fails all the same is left out, which a warning tells.
 
     Parameters
     ----------

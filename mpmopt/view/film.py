@@ -77,7 +77,7 @@ class Screen:
     Parameters
     ----------
     motions : sequence of Motion
-        Of one scene at the same instants.
+        At the same times.
     slow : float
         How many times slower they are shown, which the picture says.
     books : sequence of Books, optional

@@ -307,7 +307,7 @@ def _tables(
 ) -> dict[str, Any]:
     zero, rest = run.origin, dict(summary)
     result = run.result
-    travel = {
+    placed = {
         text: None if rest[name] is None else rest[name] - zero
         for name, text in PLACED.items()
         if name in rest
@@ -322,7 +322,7 @@ def _tables(
     others = {name: rest.pop(name) for name in ACTUATION if name in rest}
     rows = zip(run.task.subject_to, result.constraints, result.multipliers)
     return {
-        "travel": travel,
+        "placed": placed,
         "retained": retained,
         "more": rest,
         "actuation": others,
