@@ -320,7 +320,7 @@ def test_the_presets_are_what_they_say():
 
 
 def test_the_table_at_the_end_says_what_a_number_is_of():
-    summary = {
+    summary: dict[str, Any] = {
         "disconnected_particles": 6, "components": 2, "speed": 1e-4, "driven_share": None,
         "speed_by_friction": {}, "failures": {}, "way": "stands",
     }  # fmt: skip
