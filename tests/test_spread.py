@@ -110,7 +110,7 @@ def test_a_table_and_a_picture_have_all_robots(a_run, tmp_path, monkeypatch, cap
 def test_a_film_shows_a_robot_in_all_scenes_of_its_task(
     a_run, tmp_path, monkeypatch, caplog, capsys
 ):
-    monkeypatch.setattr(ensemble, "SHOWN", 0.04)
+    monkeypatch.setattr(ensemble, "SHOWN", 2.0)
     names: list[Any] = []
 
     class Screen(ensemble.Screen):
@@ -122,19 +122,23 @@ def test_a_film_shows_a_robot_in_all_scenes_of_its_task(
     body_of = ensemble.body_of
 
     def fails(robot, scene, name):
-        if "strength" in name:
+        too_long = name == "friction 0.25" and scene.time_step > 0.6 * a_run.scene.time_step
+        if "strength" in name or too_long:
             raise SimulationError("it burst", 3, -1, (0.0, 0.0), "none")
         return body_of(robot, scene, name)
 
     monkeypatch.setattr(ensemble, "body_of", fails)
     scenes = Variation(friction=0.25), Variation(refinement=2), Variation(strength=1.1)
-    run = dataclasses.replace(a_run, task=Task(scenes=scenes))
+    scene = dataclasses.replace(a_run.scene, transient=0.02)
+    run = dataclasses.replace(a_run, scene=scene, task=Task(scenes=scenes))
     filmed = ensemble.film_scenes(tmp_path / "scenes.gif", run, 0.2)
+    assert filmed.slow == pytest.approx(0.2 / 0.04)  # two transients
     assert names == ["friction 0.25", "refinement 2"]
     assert "without the scene of strength 1.1" in caplog.text
     with Image.open(BytesIO((tmp_path / "scenes.gif").read_bytes())) as film:
         assert film.n_frames == filmed.frames == 5
     names.clear()
+    monkeypatch.setattr(ensemble, "SHOWN", 0.04)
     runfile.write(tmp_path / "run.h5", a_run)
     assert main(["scenes", str(tmp_path / "run.h5"), "--seconds", "0.2"]) == 0
     assert f"{tmp_path / 'scenes.gif'}: 5 frames" in capsys.readouterr().out

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,8 @@ from numpy.typing import NDArray
 
 from mpmopt.assess.robustness import FEW_FRICTIONS, Robot, lasting, unit
 from mpmopt.assess.trajectory import Motion, equal_steps
+from mpmopt.design.problem import Problem
+from mpmopt.design.step_control import with_halvings
 from mpmopt.design.variation import Variation
 from mpmopt.errors import DesignError, SimulationError
 from mpmopt.io.files import replace_file
@@ -29,7 +32,7 @@ def film_scenes(path: Path, run: Optimisation, seconds: float = SECONDS) -> Film
     """Write a film of a run's finished robot in all scenes of its task, from rest.
 
     In scenes of several frictions if the task has none of its own. Where it cannot be simulated,
-    a scene is left out.
+    with steps halved up to `Problem.halvings` times, a scene is left out.
 
     Parameters
     ----------
@@ -56,13 +59,17 @@ def film_scenes(path: Path, run: Optimisation, seconds: float = SECONDS) -> Film
     if count < 2:
         raise DesignError(f"film: seconds = {seconds!r} must be from {2 / RATE:g} to 600")
     scenes = run.task.scenes or tuple(Variation(friction=value) for value in FEW_FRICTIONS)
-    robot, motions = Robot.of(problem, run.result.x), []
-    shown = SHOWN * unit(problem.scene)
+    x, shown, motions = run.result.x, SHOWN * unit(problem.scene), []
+
+    def motion(variation: Variation, problem: Problem) -> Motion:
+        scene = lasting(variation.scene(problem.scene), shown)
+        body = body_of(Robot.of(problem, x), scene, str(variation))
+        return Motion.of(body, equal_steps(scene, count))
+
     for variation in scenes:
         try:
-            scene = lasting(variation.scene(problem.scene), shown)
-            body = body_of(robot, scene, str(variation))
-            motions.append(Motion.of(body, equal_steps(scene, count)))
+            seen, _ = with_halvings(problem, partial(motion, variation), problem.halvings)
+            motions.append(seen)
         except SimulationError as error:
             logger.warning("the film is without the scene of %s: %s", variation, error)
     if not motions:
@@ -77,5 +84,5 @@ def film_scenes(path: Path, run: Optimisation, seconds: float = SECONDS) -> Film
 
         content = encoded(path, frames())
     replace_file(path, content)
-    per_period = count * robot.period(problem.scene) / shown
+    per_period = count * Robot.of(problem, x).period(problem.scene) / shown
     return Filmed(count, seconds + LAST, seconds / shown, per_period, len(content))

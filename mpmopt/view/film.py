@@ -21,6 +21,7 @@ from PIL import Image
 from mpmopt.assess.forces import Books, books
 from mpmopt.assess.robustness import SEEN, SETTLED, Robot, can_be_studied, lasting, unit
 from mpmopt.assess.trajectory import (
+    Body,
     Motion,
     equal_steps,
     moving,
@@ -28,6 +29,7 @@ from mpmopt.assess.trajectory import (
     post_processed,
     reference,
 )
+from mpmopt.design.problem import Problem
 from mpmopt.errors import DesignError, MissingLibraryError, StorageError
 from mpmopt.io.files import replace_file
 from mpmopt.io.progress import Progress
@@ -271,12 +273,11 @@ def film(
     def frames_of(scene: Scene) -> NDArray[np.int64]:
         return equal_steps(scene, count, round(begin / scene.time_step))
 
-    if finished:
-        bodies = [body_of(Robot.of(problem, x), scene)]
-        motions = [Motion.of(bodies[0], frames_of(scene))]
-    else:
-        makes = optimised, post_processed, reference
-        bodies, motions = map(list, zip(*moving(problem, x, makes, frames_of)))
+    def robot(problem: Problem, x: NDArray[np.float64]) -> Body:
+        return body_of(Robot.of(problem, x), lasting(problem.scene, begin + duration))
+
+    makes = (robot,) if finished else (optimised, post_processed, reference)
+    bodies, motions = map(list, zip(*moving(problem, x, makes, frames_of)))
     slow = seconds / duration
     screen = Screen(motions, slow, [books(body.simulation) for body in bodies] if forces else ())
     with Progress("frames", screen.frames) as progress:
