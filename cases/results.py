@@ -69,9 +69,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of results")
     parser.add_argument("--docs", action="store_true", help="copy them to where the docs read them")
     options = parser.parse_args(argv)
-    return reported(
-        lambda: work(options.out, options.docs), lambda: "The same command goes on."
-    )
+    return reported(lambda: work(options.out, options.docs), lambda: "The same command goes on.")
 
 
 if __name__ == "__main__":
