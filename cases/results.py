@@ -47,7 +47,7 @@ def commands(out: Path) -> Iterator[list[str]]:
         folder = str(out / f"spread-{setting}")
         yield case("spread", "walker", "--setting", setting, "--out", folder)
     yield case("paper_tables", "--out", str(out / "paper"))
-    yield case("optimisers", "--out", str(out / "optimisers"))
+    yield case("optimisers", "--starts", "2", "--out", str(out / "optimisers"))
 
 
 def work(out: Path, docs: bool) -> int:
