@@ -7,16 +7,16 @@ optimisers, which each go on where they were stopped and leave alone what DIR ho
 """
 
 import argparse
-import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+from mpmopt.__main__ import ROBOTS
 from mpmopt.io.console import reported
+from mpmopt.io.files import replace_file
 
 ROOT = Path(__file__).parent.parent
-ROBOTS = "walker", "crawler", "climber", "terrain", "silicone"
 # Where the docs read what is left in DIR.
 PAGES = {
     "robots.csv": "docs/results/robots.csv",
@@ -59,7 +59,7 @@ def work(out: Path, docs: bool) -> int:
             return code
     if docs:
         for name, page in PAGES.items():
-            shutil.copy(out / name, ROOT / page)
+            replace_file(ROOT / page, (out / name).read_bytes())
     return 0
 
 
