@@ -240,7 +240,7 @@ class LagrangianSimulation(Simulation):
 
     def node_states(self) -> Iterator[NDArray]:
         """The states (4, M) of the nodes after 0, 1, ... steps, one after the other."""
-        segment = self.segment(self.at_once)
+        segment = self.segment(min(self.at_once, self.steps))
         yield self.start
         for first, last in self._parts(segment):
             yield from segment.states[1 : last - first + 1].copy()

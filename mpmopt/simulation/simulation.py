@@ -223,7 +223,7 @@ class Simulation:
         SimulationError
             As `run`.
         """
-        segment = self.segment(self.at_once)
+        segment = self.segment(min(self.at_once, self.steps))
         yield segment.state(0)
         for first, last in self._parts(segment):
             for slot in range(1, last - first + 1):
@@ -254,7 +254,7 @@ class Simulation:
         SimulationError
             As `run`.
         """
-        segment = self.segment(self.at_once)
+        segment = self.segment(min(self.at_once, self.steps))
         watcher = Watcher(segment, instants)
         for first, last in self._parts(segment):
             watcher.follow(first, last)
