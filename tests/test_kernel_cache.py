@@ -15,6 +15,7 @@ from mpmopt.design.problem import Problem
 from mpmopt.kernels import compiler
 from mpmopt.simulation import buffers, lagrangian
 
+compiled = pytest.mark.skipif(bool(getattr(config, "DISABLE_JIT", 0)), reason="nothing is compiled")
 LOOP = """
 from kernels.callee import callee
 from kernels.compiler import loop_jit
@@ -34,34 +35,74 @@ PROGRAM = """
 from kernels.loop import loop
 print(loop(1.0), sum(loop.stats.cache_hits.values()))
 """
+ENDED = (
+    """
+import os
+replace, replaced = os.replace, []
+
+def ended_between(*names):
+    if replaced:
+        os._exit(3)
+    replaced.append(replace(*names))
+
+os.replace = ended_between
+"""
+    + PROGRAM
+)
 
 
-@pytest.mark.cache
-@pytest.mark.skipif(bool(getattr(config, "DISABLE_JIT", 0)), reason="nothing is compiled")
-def test_an_edited_callee_in_another_file_is_never_stale(tmp_path):
-    package = tmp_path / "kernels"
-    package.mkdir()
-    shutil.copy(compiler.__file__, package)
-    (package / "loop.py").write_text(LOOP)
+class Package:
+    """A loop that calls a function of another file, in a folder of its own."""
 
-    def run(number: str) -> tuple[float, int]:
-        """The loop's result, and how often it came from the disk."""
-        callee: Path = package / "callee.py"
-        text = CALLEE.format(number)
-        if not callee.exists() or callee.read_text() != text:
-            callee.write_text(text)
-        done = subprocess.run(
-            [sys.executable, "-c", PROGRAM],
-            env={**os.environ, "PYTHONPATH": str(tmp_path), "NUMBA_CACHE_DIR": str(tmp_path)},
-            cwd=tmp_path, capture_output=True, text=True, check=True,
+    def __init__(self, folder: Path):
+        self.folder = folder
+        self.kernels = folder / "kernels"
+        self.kernels.mkdir()
+        shutil.copy(compiler.__file__, self.kernels)
+        (self.kernels / "loop.py").write_text(LOOP)
+
+    def write(self, number: str) -> None:
+        """The number that the callee adds."""
+        (self.kernels / "callee.py").write_text(CALLEE.format(number))
+
+    def start(self, program: str = PROGRAM) -> subprocess.CompletedProcess[str]:
+        path = str(self.folder)
+        return subprocess.run(
+            [sys.executable, "-c", program],
+            env={**os.environ, "PYTHONPATH": path, "NUMBA_CACHE_DIR": path},
+            cwd=path, capture_output=True, text=True,
         )  # fmt: skip
+
+    def run(self) -> tuple[float, int]:
+        """The loop's result, and how often it came from the disk."""
+        done = self.start()
+        assert not done.returncode, done.stderr
         value, hits = done.stdout.split()
         return float(value), int(hits)
 
-    assert run("1.0") == (2.0, 0)
-    assert run("1.0") == (2.0, 1)
-    assert run("2.0") == (3.0, 0)
-    assert run("2.0") == (3.0, 1)
+
+@pytest.mark.cache
+@compiled
+def test_an_edited_callee_in_another_file_is_never_stale(tmp_path):
+    package = Package(tmp_path)
+    package.write("1.0")
+    assert package.run() == (2.0, 0)
+    assert package.run() == (2.0, 1)
+    package.write("2.0")
+    assert package.run() == (3.0, 0)
+    assert package.run() == (3.0, 1)
+    assert len(list(tmp_path.rglob("loop.loop*.nbc"))) == 1
+
+
+@pytest.mark.cache
+@compiled
+def test_a_process_that_is_ended_while_it_writes_leaves_nothing_stale(tmp_path):
+    package = Package(tmp_path)
+    package.write("1.0")
+    assert package.run() == (2.0, 0)
+    package.write("2.0")
+    assert package.start(ENDED).returncode == 3
+    assert package.run()[0] == 3.0
 
 
 def test_a_loop_is_to_compile_where_the_disk_has_none_and_numba_tells():

@@ -7,10 +7,13 @@ is stamped with a digest of all kernels' sources: after any change all of them a
 import hashlib
 import logging
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import numba
 from numba import njit
+from numba.core.caching import IndexDataCacheFile
 from numba.core.registry import cpu_target
 
 
@@ -117,7 +120,28 @@ def is_to_compile(kernel: Any, arguments: tuple[Any, ...]) -> bool:
 
 
 def _stamped(kernel: Any) -> Any:
-    file = getattr(getattr(kernel, "_cache", None), "_cache_file", None)
-    if file is not None:  # the compiler and its cache are on
-        file._source_stamp = STAMP
+    cache: Any = getattr(kernel, "_cache", None)
+    if hasattr(cache, "_cache_file"):  # the compiler and its cache are on
+        cache._cache_file = _CacheFile(cache._cache_path, cache._impl.filename_base, STAMP)
     return kernel
+
+
+class _CacheFile(IndexDataCacheFile):
+    """What the disk keeps of a kernel: what the index names is what was compiled for it.
+
+    Numba writes the index first, and the data under a name that others had before them. A process
+    that reads in between, or after one that was ended there, would run what was compiled of older
+    sources, by another version, or for other types.
+    """
+
+    def save(self, key: Any, data: Any) -> None:
+        """Write data under a name of their own, then the index, and remove what that does not name."""
+        of = repr((numba.__version__, STAMP, key)).encode()
+        name = self._data_name(int(hashlib.sha256(of).hexdigest()[:15], 16))
+        self._save_data(name, data)
+        overloads = {**self._load_index(), key: name}
+        self._save_index(overloads)
+        for path in Path(self._cache_path).glob(self._index_name.replace(".nbi", ".*.nbc")):
+            if path.name not in overloads.values():
+                with suppress(OSError):  # another process was faster, or reads it
+                    path.unlink()
