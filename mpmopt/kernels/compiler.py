@@ -135,7 +135,7 @@ class _CacheFile(IndexDataCacheFile):
     """
 
     def save(self, key: Any, data: Any) -> None:
-        """Write data under a name of their own, then the index, and remove what that does not name."""
+        """Write data under a name of their own, then the index; remove what that does not name."""
         of = repr((numba.__version__, STAMP, key)).encode()
         name = self._data_name(int(hashlib.sha256(of).hexdigest()[:15], 16))
         self._save_data(name, data)
