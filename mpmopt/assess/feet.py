@@ -60,20 +60,21 @@ def feet(motion: Motion) -> list[Foot]:
     scene = motion.scene
     half = len(motion.gamma) // (1 if scene.mirror is None else 2)
     position = motion.position[:, :, :half].astype(float)
-    supports = {
-        f"ground {k}": (layer.line.distance(np.moveaxis(position, 1, 0))[0], layer.thickness)
-        for k, layer in enumerate(scene.layers)
-    }
+    width = motion.spacing if scene.formulation == "total" else 0.0
+    supports = {}
+    for k, layer in enumerate(scene.layers):
+        away, _ = layer.line.distance(np.moveaxis(position, 1, 0))
+        supports[f"ground {k}"] = away, layer.pressed(away, width)
     for k, wall in enumerate(scene.walls):
         away = position[:, "xy".index(wall.axis)] - wall.position
         away = away if wall.solid_side == "below" else -away
-        supports[f"wall {k}"] = away, NEAR * scene.grid.dx
+        supports[f"wall {k}"] = away, np.maximum(1.0 - away / (NEAR * scene.grid.dx), 0.0)
     index = np.floor(position[0] / motion.spacing).astype(int)
     i, j = index - index.min(axis=1, keepdims=True)
     near, along = np.ones((3, 3)), np.einsum("k,fkp->fp", scene.direction, position)
     found = []
-    for name, (distance, thickness) in supports.items():
-        depth = np.maximum(1.0 - distance / thickness, 0.0) * (motion.gamma[:half] >= 0.5)
+    for name, (distance, pressed) in supports.items():
+        depth = pressed * (motion.gamma[:half] >= 0.5)
         often = depth.any(axis=0)
         lattice = np.zeros((i.max() + 1, j.max() + 1), dtype=bool)
         lattice[i[often], j[often]] = True

@@ -213,7 +213,7 @@ class _Account:
     def __init__(self, simulation: Simulation) -> None:
         self.simulation, self.scene = simulation, simulation.scene
         scene = simulation.scene
-        self.layers = scene.layers
+        self.layers, self.width = scene.layers, 0.0  # over which a layer's pressure is a mean
         data, count = simulation.data, simulation.initial.shape[1]
         halves = 1 if scene.mirror is None else 2
 
@@ -271,7 +271,7 @@ class _Account:
         for force, layer in zip(forces, self.layers):
             d, normal = layer.line.distance(x)
             force[:] = self.stiffness * self.volume * layer.stiffness
-            force *= np.maximum(1.0 - d / layer.thickness, 0.0)
+            force *= layer.pressed(d, self.width)
             normals.append(normal)
         return forces, np.array(normals).reshape(-1, *x.shape)
 
@@ -289,11 +289,10 @@ class _Account:
         x, F = self._midway(state)
         log_J = self._logarithm(F)
         density = kernels.plain(kernels.energy_density)(F.reshape(4, -1), log_J, self.constants)
-        borne, _ = self._bearing(x)
-        share = 2.0 * self.stiffness * self.volume
+        share = self.stiffness * self.volume
         layer = sum(
-            float((b**2 / share).sum()) * layer.thickness / layer.stiffness
-            for b, layer in zip(borne, self.layers)
+            float(share @ each.stored(each.line.distance(x)[0], self.width)) * each.stiffness
+            for each in self.layers
         )
         fallen = -float((self.mass * x).sum(axis=1) @ self.scene.gravity)
         elastic = float((self.volume * density).sum())
@@ -426,6 +425,7 @@ class _LatticeAccount(_Account):
 
     def _prepare(self) -> None:
         lattice = self.simulation.lattice
+        self.width = float(np.sqrt(lattice.volume))
         # Nodes beside the mirror plane have their image's mass too, and stand for half a node each.
         shares = np.ones(self._lines)
         if lattice.mirror_axis >= 0:

@@ -38,7 +38,9 @@ def indicators(state, data, parameters, first, last):
                 if len(parameters.ground.layers):
                     x, y = state[at(g, POSITION), k].real, state[at(g, POSITION + 1), k].real
                     share = data.stiffness[g, k].real * specific
-                    elastic += 0.25 * parameters.dt * parameters.dt * share * rise(x, y, parameters)
+                    elastic += (
+                        0.25 * parameters.dt * parameters.dt * share * rise(x, y, 0.0, parameters)
+                    )
                 viscous = viscous_modulus(trace, apart, constants) * specific
                 viscous *= per_cell / parameters.dx
                 if data.stiffness[g, k].real >= SOLID:

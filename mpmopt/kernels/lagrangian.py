@@ -28,7 +28,7 @@ from mpmopt.kernels.ground import (
     distance,
     distance_adjoint,
 )
-from mpmopt.kernels.layer import bearing, bearing_adjoint, resistance, resistance_adjoint
+from mpmopt.kernels.layer import mean_bearing, mean_bearing_adjoint, resistance, resistance_adjoint
 from mpmopt.kernels.material import solid_constants
 from mpmopt.kernels.pairs import nowhere, push_apart, push_apart_adjoint, renewed
 from mpmopt.kernels.simd import (
@@ -450,8 +450,9 @@ def is_clear(x, y, lattice):
     i, j = math.floor(x / lattice.dx + 0.5), math.floor(y / lattice.dx + 0.5)
     if not (0 <= i < lattice.nodes_x and 0 <= j < lattice.nodes_y):
         return False
-    # No distance from that node is more than 0.71 cells, and none changes by more than one goes.
-    return lattice.ground.clearance[i * lattice.nodes_y + j] > (SKIN + 0.75) * lattice.dx
+    # No distance from that node is more than 0.71 cells, none changes by more than one goes, and
+    # what a particle is wide reaches half a cell at most.
+    return lattice.ground.clearance[i * lattice.nodes_y + j] > (SKIN + 1.25) * lattice.dx
 
 
 @bare_loop_jit
@@ -504,7 +505,7 @@ def press(state, lattice, near, rows, force):
 @bare_jit
 def bear(rows, r, i, a, lattice):
     """The loads b n_x, b n_y, b of record r: a-th particles along x of cells from i on."""
-    layers = lattice.ground.layers
+    layers, width = lattice.ground.layers, math.sqrt(lattice.volume)
     x, y = value(rows, 0, i, a, lattice), value(rows, 1, i, a, lattice)
     for k in range(4):
         capacity = lattice.volume * lattice.stiffness[r, k]
@@ -512,8 +513,8 @@ def bear(rows, r, i, a, lattice):
             for m in range(len(layers)):
                 d, nx, ny, _ = distance(x[k], y[k], lattice.ground, m)
                 thickness = layers[m, THICKNESS]
-                if d.real < thickness:
-                    size = bearing(d, thickness, layers[m, STIFFNESS] * capacity)
+                if d.real < thickness + 0.5 * width:
+                    size = mean_bearing(d, thickness, width, layers[m, STIFFNESS] * capacity)
                     at = MARGIN + i + k
                     rows.stress[0, 0, a, at] += size * nx
                     rows.stress[1, 0, a, at] += size * ny
@@ -545,7 +546,7 @@ def press_adjoint(state, force_bar, lattice, near, rows, state_bar, bar):
 @bare_jit
 def bear_adjoint(rows, r, i, a, lattice, bar):
     """The loads x_bar, y_bar of record r from f_bar and f_N_bar there; adds to stiffness_bar."""
-    layers = lattice.ground.layers
+    layers, width = lattice.ground.layers, math.sqrt(lattice.volume)
     x, y = value(rows, 0, i, a, lattice), value(rows, 1, i, a, lattice)
     qx, qy = value(rows, 2, i, a, lattice), value(rows, 3, i, a, lattice)
     size_bar = value(rows, 4, i, a, lattice)
@@ -555,11 +556,11 @@ def bear_adjoint(rows, r, i, a, lattice, bar):
             for m in range(len(layers)):
                 d, nx, ny, bend = distance(x[k], y[k], lattice.ground, m)
                 thickness = layers[m, THICKNESS]
-                if d < thickness:
+                if d < thickness + 0.5 * width:
                     full = layers[m, STIFFNESS] * capacity
-                    size = bearing(d, thickness, full)
+                    size = mean_bearing(d, thickness, width, full)
                     b_bar = size_bar[k] + nx * qx[k] + ny * qy[k]
-                    d_bar, full_bar = bearing_adjoint(d, thickness, full, b_bar)
+                    d_bar, full_bar = mean_bearing_adjoint(d, thickness, width, full, b_bar)
                     x_bar, y_bar = distance_adjoint(nx, ny, bend, d_bar, size * qx[k], size * qy[k])
                     bar.stiffness[r, k] += layers[m, STIFFNESS] * lattice.volume * full_bar
                     at = MARGIN + i + k

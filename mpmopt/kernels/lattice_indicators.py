@@ -75,7 +75,8 @@ def margins(state, solid, data, parameters):
                 if len(parameters.ground.layers):
                     x = state[at(g, POSITION), k].real
                     y = state[at(g, POSITION + 1), k].real
-                    elastic += 0.25 * dt * dt * specific * rise(x, y, parameters)
+                    half_width = 0.5 * math.sqrt(data.volume[g, k].real)
+                    elastic += 0.25 * dt * dt * specific * rise(x, y, half_width, parameters)
                 viscous = step / dx * eta[k] * s2 * specific
                 courant = max(courant, viscous + math.sqrt(viscous * viscous + elastic))
                 smallest = min(smallest, J[k])

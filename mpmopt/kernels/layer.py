@@ -40,16 +40,46 @@ def bearing_adjoint(d, thickness, capacity, b_bar):
 
 
 @jit
-def rise(x, y, parameters):
-    """How fast layers' forces on solid at a place rise with depth: the sum of kappa / thickness."""
+def reach(d, thickness, width):
+    """How deep the nearest point of a particle at d is in a layer, and how much of its width is."""
+    deepest = thickness - d + 0.5 * width
+    if deepest.real >= width:
+        return deepest, width + 0.0 * d
+    return (deepest, deepest) if deepest.real > 0.0 else (0.0 * d, 0.0 * d)
+
+
+@jit
+def mean_bearing(d, thickness, width, capacity):
+    """Mean of `bearing` over places within width/2 of d, as the narrower particles of finer cells.
+
+    So the force does not depend on where in a layer a row of particles lies, and rises smoothly.
+    """
+    deepest, inside = reach(d, thickness, width)
+    return capacity * inside * (deepest - 0.5 * inside) / (width * thickness)
+
+
+@jit
+def mean_bearing_adjoint(d, thickness, width, capacity, b_bar):
+    """From b_bar to d_bar and capacity_bar."""
+    deepest, inside = reach(d, thickness, width)
+    b_bar = b_bar * inside / (width * thickness)
+    return -b_bar * capacity, b_bar * (deepest - 0.5 * inside)
+
+
+@jit
+def rise(x, y, margin, parameters):
+    """How fast layers' forces on solid at a place rise with depth: the sum of kappa / thickness.
+
+    Of those layers that are within a margin.
+    """
     ground, found = parameters.ground, 0.0
     i, j = round(x * parameters.per_dx), round(y * parameters.per_dx)
     known = 0 <= i < parameters.nodes_x and 0 <= j < parameters.nodes_y
-    if known and ground.clearance[i * parameters.nodes_y + j] > parameters.dx:
+    if known and ground.clearance[i * parameters.nodes_y + j] > parameters.dx + margin:
         return found
     for n in range(len(ground.layers)):
         d, _, _, _ = distance(x, y, ground, n)
-        if d < ground.layers[n, THICKNESS]:
+        if d < ground.layers[n, THICKNESS] + margin:
             found += ground.layers[n, STIFFNESS] / ground.layers[n, THICKNESS]
     return found
 

@@ -19,6 +19,8 @@ from mpmopt.validation import number, shown
 if TYPE_CHECKING:
     from mpmopt.scene.scene import Scene
 
+Array = NDArray[Any]
+
 MOST_POINTS = 1000
 MOST_TOLD = 5  # segments, each of which a scene's text tells
 # Directions that differ by less, and lengths in units of the whole polyline's, are the same.
@@ -35,8 +37,9 @@ class Ground(Checked):
 
     A particle at a distance d from the ground, less than the thickness, is pushed along the normal
     by `stiffness` (1 - d / thickness) per volume, times its share of the solid's stiffness, so that
-    void does not stand. Friction and damping act on the nodes that it moves. A body rests within
-    the layer: place it at least a thickness above the points, or the layer throws it off.
+    void does not stand; in the total Lagrangian formulation by the mean of that over its width.
+    Friction and damping act on the nodes that it moves. A body rests within the layer: place it at
+    least a thickness above the points, or the layer throws it off.
 
     Parameters
     ----------
@@ -311,6 +314,24 @@ class Layer(NamedTuple):
             damping=DAMPING / speed if damping is None else damping,
             creeping_speed=CREEPING * speed if creeping is None else creeping,
         )
+
+    def pressed(self, d: Array, width: float) -> Array:
+        """`kernels.mean_bearing` of a capacity of one; of a width of zero, `kernels.bearing`."""
+        if width == 0.0:
+            return np.maximum(1.0 - d / self.thickness, 0.0)
+        deepest, inside = self._reach(d, width)
+        return inside * (deepest - 0.5 * inside) / (width * self.thickness)
+
+    def stored(self, d: Array, width: float) -> Array:
+        """The energy of which `pressed` is the force."""
+        if width == 0.0:
+            return 0.5 * self.thickness * self.pressed(d, width) ** 2
+        deepest, inside = self._reach(d, width)
+        return (deepest**3 - (deepest - inside) ** 3) / (6.0 * width * self.thickness)
+
+    def _reach(self, d: Array, width: float) -> tuple[Array, Array]:
+        deepest = np.maximum(self.thickness - d + 0.5 * width, 0.0)
+        return deepest, np.minimum(deepest, width)
 
 
 def _speed(scene: Scene) -> float:
