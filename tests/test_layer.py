@@ -101,6 +101,61 @@ def test_what_bears_is_the_slope_of_what_is_stored():
         assert share_bar == pytest.approx(law("bearing")(d, 0.9, share).imag / COMPLEX_STEP)
 
 
+@pytest.mark.parametrize("width", [0.3, 2.5])  # the other one is wider than the layer
+def test_a_mean_is_what_narrower_particles_bear(width):
+    for d in (-0.3, 0.7, 0.9, 1.2, 3.0):
+        parts = d + width * ((np.arange(4000) + 0.5) / 4000 - 0.5)
+        expected = np.mean([law("bearing")(part, 0.9, 5.0) for part in parts])
+        assert law("mean_bearing")(d, 0.9, width, 5.0) == pytest.approx(expected, abs=1e-6)
+        moved, share = complex(d, COMPLEX_STEP), complex(5.0, COMPLEX_STEP)
+        d_bar, share_bar = law("mean_bearing_adjoint")(d, 0.9, width, 5.0, 2.0)
+        varied = law("mean_bearing")(moved, 0.9, width, 5.0).imag / COMPLEX_STEP
+        assert d_bar == pytest.approx(2.0 * varied)
+        varied = law("mean_bearing")(d, 0.9, width, share).imag / COMPLEX_STEP
+        assert share_bar == pytest.approx(2.0 * varied)
+
+
+@pytest.mark.parametrize("width", [0.0, 0.3 * C, 2.5 * C])
+def test_layers_know_what_their_kernels_do(width):
+    (floor,) = standing("floor").layers
+    for d in (-0.3 * C, 0.7 * C, 0.99 * C, 3.0 * C):
+        law_of = law("mean_bearing") if width else lambda d, delta, _, full: law("bearing")(
+            d, delta, full)  # fmt: skip
+        assert floor.pressed(np.array(d), width) == pytest.approx(
+            law_of(d, floor.thickness, width, 1.0)
+        )
+        step = 1e-6 * C
+        energy = floor.stored(np.array([d - step, d + step]), width)
+        slope = (energy[0] - energy[1]) / (2.0 * step)
+        assert slope == pytest.approx(float(floor.pressed(np.array(d), width)), abs=1e-5)
+
+
+@pytest.mark.parametrize("width", [0.01, 0.3, 0.7, 2.0])
+def test_rows_add_up_to_the_same_wherever_they_lie(width):
+    for surface in np.linspace(-0.5, 0.8, 7):
+        rows = surface + width * (np.arange(200) + 0.5)
+        borne = width * sum(law("mean_bearing")(row, 0.9, width, 5.0) for row in rows)
+        # The integral of 5 <1 - s/0.9> from the surface on.
+        assert borne == pytest.approx(5.0 * (0.9 - surface) ** 2 / 1.8, rel=1e-12)
+
+
+@pytest.mark.parametrize("cells", [16, 24, 32])
+def test_a_lattice_sinks_as_deep_as_the_layer_says_on_any_cells(cells):
+    c, height, thickness, stiffness = 1 / cells, 0.25, 1 / 16, 3e3
+    depth = math.sqrt(2.0 * thickness * 10.0 * height / stiffness)
+    scene = Scene(
+        Grid((cells, cells), c), 2e-3 * c, 250 * cells, gravity=(0.0, -10.0), direction=(0.0, 1.0),
+        material=Material(3e3, 3e3, viscosity=0.3), formulation="total",
+        body=(Solid((0.25, 0.5), (0.75, 0.5 + height)),),
+        ground=(Ground.floor(0.5 + depth - thickness, thickness=thickness, damping=20.0,
+                             stiffness=stiffness),),
+    )  # fmt: skip
+    simulation = Problem(scene, halvings=0, limits=None).simulation(np.zeros(0))
+    assert simulation.run()[3].max() < 1e-3
+    fallen = (simulation.run() - simulation.initial)[1].mean()
+    assert abs(fallen) <= 5e-3 * depth
+
+
 def moving(scene, rng, dtype=float):
     """A body of any material in rough motion."""
     particles = discretise(scene)
