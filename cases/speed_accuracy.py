@@ -80,21 +80,19 @@ def crawler_phi(position: np.ndarray) -> np.ndarray:
     return legs(np.min(lines, axis=0), 2 * C, 0.8)
 
 
-# Of one pass of the design filter on 64 cells, so that from there on robots are the same on all.
-FILTER = 0.85 / 64
 # A stroke and a quarter between walls, two and a half on ground: as long as gradients have a limit.
 WALLED, DURATION = 0.25, 0.5
 
 
 def lasting(scene: Scene, duration: float) -> Scene:
-    """The scene for another duration, and with the chart's filter."""
-    return replace(scene, steps=round(duration / scene.time_step), filter_length=FILTER)
+    """The scene for another duration."""
+    return replace(scene, steps=round(duration / scene.time_step))
 
 
 def on_ground(scene: Scene) -> Scene:
     """A robot on ground, whose travel counts from the start."""
     material = Material(viscosity=0.02, **FLOORS)
-    scene = replace(scene, transient=0.0, material=material)
+    scene = replace(scene, transient=0.0, filter_length=0.0, material=material)
     return lasting(replace(scene, formulation="updated"), DURATION)
 
 
@@ -115,12 +113,23 @@ ROBOTS: dict[str, tuple[Scene, Callable[[np.ndarray], np.ndarray]]] = {
 }
 
 
+# What the design filter, a pass on 64 cells, blurs; on finer ones phi is blurred by the rest before.
+BLUR = math.sqrt(0.7) / 64
+
+
 def design(phi: Callable[[np.ndarray], np.ndarray]) -> Callable[[Problem], np.ndarray]:
     """A robot's variables in any problem, driven as at the start of an optimisation."""
 
     def variables(problem: Problem) -> np.ndarray:
         position = problem.particles.position[problem.particles.designed]
-        return problem.join(phi(position), a=1.0, theta=-0.3, b=-0.5)
+        spread = math.sqrt(max(BLUR**2 - problem.scene.filter_spread**2, 0.0))
+        places, weights = np.polynomial.hermite_e.hermegauss(5)
+        blurred = sum(
+            wx * wy * phi(position + spread * np.array([x, y])) / (2.0 * math.pi)
+            for x, wx in zip(places, weights)
+            for y, wy in zip(places, weights)
+        )
+        return problem.join(blurred, a=1.0, theta=-0.3, b=-0.5)
 
     return variables
 

@@ -91,7 +91,8 @@ def test_a_body_that_is_not_pushed_goes_on_as_if_nothing_had_been(formulation):
 
 @pytest.mark.parametrize("formulation", ["updated", "total"])
 def test_a_push_adds_a_velocity_to_all_of_a_body(formulation):
-    scene = on_ground(formulation, steps=10, gravity=(0.0, 0.0))
+    below = (Ground.floor(2.5 * C, friction=0.4, thickness=C),)
+    scene = on_ground(formulation, steps=10, gravity=(0.0, 0.0), ground=below)
     simulation = robot_in(scene).body(scene)
     before, after = simulation.run([6, 10])
     pushed = simulation.pushed(6, (0.25, -0.125))
