@@ -58,8 +58,8 @@ def crawler_on_ground(cells: int, time_step: float, seconds: float) -> Scene:
         grid=Grid(cells=(2 * cells, cells), dx=1 / cells),
         walls=(),
         ground=(
-            Ground.floor(25.3 * c, **layer),
-            Ground(((1.0, 38.7 * c), (0.0, 38.7 * c)), **layer),
+            Ground.floor(25.15 * c, **layer),
+            Ground(((1.0, 38.85 * c), (0.0, 38.85 * c)), **layer),
         ),
         body=tuple(
             replace(part, detuning=0.9) if isinstance(part, Actuator) else part
