@@ -47,7 +47,7 @@ from mpmopt.design.actuation import signal_adjoint
 from mpmopt.design.objective import Objective
 from mpmopt.design.problem import Problem
 from mpmopt.errors import MpmoptError, SceneError
-from mpmopt.scene import Material, Scene
+from mpmopt.scene import Design, Grid, Material, Scene
 from mpmopt.scene.particles import discretise
 from mpmopt.scene.scene import Formulation
 
@@ -113,8 +113,33 @@ ROBOTS: dict[str, tuple[Scene, Callable[[np.ndarray], np.ndarray]]] = {
 }
 
 
-# What the design filter, a pass on 64 cells, blurs; on finer ones phi is blurred by the rest before.
-BLUR = math.sqrt(0.7) / 64
+# Standard deviation of a pass of the design filter on 64 cells. On finer ones phi is blurred by
+# what a pass lacks there: from 64 cells on all have the same robot. On 32 it is another one.
+BLUR = replace(ROBOTS["walker"][0], grid=Grid((64, 64), 1 / 64), time_step=4e-4).filter_spread
+
+
+def blur(scene: Scene, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The places (25, N, 2) and weights (25, N) of phi that blur it at (N, 2), as the filter does.
+
+    What is not designed has no weight, and what is beyond a plane of symmetry is its image.
+    """
+    spread = math.sqrt(max(BLUR**2 - scene.filter_spread**2, 0.0))
+    steps, shares = np.polynomial.hermite_e.hermegauss(5)
+    away = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 1, 2)
+    places = position + spread * away
+    if scene.mirror is not None:
+        plane, across = scene.mirror, places[..., scene.mirror.normal]
+        side = np.sign(position[0, plane.normal] - plane.position)
+        places[..., plane.normal] = plane.position + side * abs(across - plane.position)
+    weights = np.outer(shares, shares).reshape(-1, 1) * np.any(
+        [
+            np.all((part.lower <= places) & (places <= part.upper), axis=-1)
+            for part in scene.body
+            if isinstance(part, Design)
+        ],
+        axis=0,
+    )
+    return places, weights / weights.sum(axis=0)
 
 
 def design(phi: Callable[[np.ndarray], np.ndarray]) -> Callable[[Problem], np.ndarray]:
@@ -122,16 +147,24 @@ def design(phi: Callable[[np.ndarray], np.ndarray]) -> Callable[[Problem], np.nd
 
     def variables(problem: Problem) -> np.ndarray:
         position = problem.particles.position[problem.particles.designed]
-        spread = math.sqrt(max(BLUR**2 - problem.scene.filter_spread**2, 0.0))
-        places, weights = np.polynomial.hermite_e.hermegauss(5)
-        blurred = sum(
-            wx * wy * phi(position + spread * np.array([x, y])) / (2.0 * math.pi)
-            for x, wx in zip(places, weights)
-            for y, wy in zip(places, weights)
-        )
-        return problem.join(blurred, a=1.0, theta=-0.3, b=-0.5)
+        places, weights = blur(problem.scene, position)
+        values = phi(places.reshape(-1, 2)).reshape(weights.shape)
+        return problem.join((weights * values).sum(axis=0), a=1.0, theta=-0.3, b=-0.5)
 
     return variables
+
+
+def in_patches(scene: Scene, gradient: np.ndarray) -> np.ndarray:
+    """A `density` in cells as one in squares of `PATCH`, of phi before it was blurred."""
+    nx, ny = scene.grid.cells
+    used = np.flatnonzero(gradient[: nx * ny])
+    centres = scene.grid.dx * (np.stack(np.divmod(used, ny), axis=1) + 0.5)
+    places, weights = blur(scene, centres)
+    columns, rows = (math.ceil(side / PATCH - 1e-6) for side in scene.grid.size)
+    i, j = np.floor(places / PATCH).astype(int).transpose(2, 0, 1)
+    shares = weights * gradient[used]
+    sums = np.bincount((i * rows + j).ravel(), shares.ravel(), columns * rows)
+    return np.concatenate([sums, gradient[nx * ny :]])
 
 
 @dataclass(frozen=True)
@@ -296,10 +329,11 @@ def measure_bar(n: int, courant: float, choice: Choice) -> Measured:
 def measure_robot(name: str, scene: Scene, n: int, courant: float, choice: Choice) -> Measured:
     """A robot in one discretisation."""
     _, phi = ROBOTS[name]
-    return measure(
-        scene, laid_out(scene, n, courant, choice), design(phi), BETA, PATCH,
-        repeats=2 if n < 256 else 1,
-    )  # fmt: skip
+    laid = laid_out(scene, n, courant, choice)
+    measured = measure(scene, laid, design(phi), BETA, 1 / n, repeats=2 if n < 256 else 1)
+    if measured.failure:
+        return measured
+    return replace(measured, gradient=in_patches(laid.scene(scene), measured.gradient))
 
 
 def measure_point(
@@ -428,7 +462,9 @@ def print_peer(name: str, robot: str) -> None:
                 "megabytes": next(int(s.split()[1]) for s in status if s.startswith("VmHWM"))
                 / 1024,
                 "distance": value - objective.start,
-                "gradient": density(problem, gradient, PATCH, plane).tolist(),
+                "gradient": in_patches(
+                    ROBOTS[robot][0], density(problem, gradient, scene.grid.dx, plane)
+                ).tolist(),
             }
         )
     )

@@ -61,7 +61,7 @@ TASK = replace(
     walker.TASK,
     scenes=tuple(
         replace(variation, ground=(hills(seed),))
-        for seed, variation in enumerate(walker.TASK.scenes, 1)
+        for seed, variation in enumerate(walker.TASK.scenes, 4)
     ),
 )
 

@@ -45,6 +45,15 @@ def test_feet_are_neighbours_that_touch_and_stand_in_a_row():
     assert [foot.particles.tolist() for foot in feet(west)] == [[2, 3], [1]]
 
 
+def test_a_lattice_touches_with_its_edge_and_not_by_rounding():
+    # Particles are half a cell wide: the second reaches a tenth of one into the layer.
+    motion = moving([(1.5, 1.5, 1.25, 1.5), (1.5, 1.15, 1.25, 1.25)], formulation="total")
+    (foot,) = feet(motion)
+    assert foot.particles.tolist() == [1]
+    assert foot.height * 16 == pytest.approx([1.25, 0.9])
+    assert foot.load == pytest.approx([0.0, 0.1**2 / (2 * 0.5)], rel=1e-4)
+
+
 def test_what_never_touches_or_is_void_is_no_foot():
     motion = moving([(1.5, 1.5, 1.5, 1.5), (0.5, 2.0, 2.0, 2.0)])
     assert len(feet(motion)) == 1

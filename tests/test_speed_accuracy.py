@@ -11,6 +11,7 @@ import speed_accuracy
 from exact import Bar
 from speed_accuracy import (
     BETA,
+    PATCH,
     PLAIN,
     ROBOTS,
     TOTAL,
@@ -18,16 +19,41 @@ from speed_accuracy import (
     at_equal_accuracy,
     design,
     front,
+    in_patches,
     robots,
     settings,
 )
 
-from mpmopt.assess.discretisation import Discretisation, Measured
+from mpmopt.assess.discretisation import Discretisation, Measured, density
 from mpmopt.design.problem import Problem
 from mpmopt.errors import SceneError
 from mpmopt.scene.particles import discretise
 
 BARS = (("bar", "updated"), ("bar", "total"))
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_a_robot_is_the_same_on_all_cells_and_so_is_what_its_gradient_tells(name):
+    scene, phi = ROBOTS[name]
+    solid, tells = [], []
+    for n in (64, 128):
+        laid = Discretisation.of(scene, n / scene.grid.cells[1], 0.2)
+        problem = laid.problem(scene, BETA)
+        x = design(phi)(problem)
+        volume = problem.particles.volume[0]
+        position = problem.particles.position[problem.particles.designed]
+        solid.append(density(problem, problem.join(
+            volume * problem.gamma(x), 0.0, 0.0, 0.0), PATCH))  # fmt: skip
+        # A derivative by gamma that is given as a function of position.
+        gamma_bar = volume * np.sin(40.0 * position.sum(axis=1))
+        bar = np.zeros(len(problem.particles.position))
+        bar[problem.particles.designed] = gamma_bar
+        phi_bar = problem.chain.field(problem.split(x).phi).pullback(0.0 * bar, bar)
+        by_cell = density(problem, problem.join(phi_bar, 0.0, 0.0, 0.0), 1 / n)
+        tells.append(in_patches(problem.scene, by_cell))
+        assert tells[-1].sum() == pytest.approx(phi_bar.sum())
+    for coarse, fine in (solid, tells):
+        assert np.linalg.norm(coarse - fine) < 0.06 * np.linalg.norm(fine)
 
 
 def bar_errors(n, courant, **options):

@@ -14,6 +14,7 @@ from mpmopt.scene.particles import own
 FEET = 6  # that are told at most: those that bear for longest
 # Of the one that bears most: what bears less than this share of that in all is no foot.
 RARELY = 0.01
+TOUCHES = 1e-3  # of what a layer bears at the ground: less is rounding
 NEAR = 0.75  # cells from a wall within which a particle touches it
 BEARS = 0.1  # of the largest load on any foot: one with more stands
 
@@ -27,10 +28,11 @@ class Foot:
     name : str
     particles : (K,) array of int
     place, height : (F,) arrays
-        Its mean coordinate along the direction, and its least distance from what it stands on.
+        Its mean coordinate along the direction, and its least distance from what it stands on: in
+        the total Lagrangian formulation that of an edge of a particle.
     load : (F,) array
-        Sum over its particles of how deep they are in the layer, over its thickness: times what a
-        particle bears, the normal force.
+        Sum over its particles of how deep they are in the layer, over its thickness; in the total
+        Lagrangian formulation of the mean over their width. The normal force is in proportion.
     stands : (F,) array of bool
         Whether that is more than `BEARS` of the largest on any foot.
     """
@@ -64,7 +66,7 @@ def feet(motion: Motion) -> list[Foot]:
     supports = {}
     for k, layer in enumerate(scene.layers):
         away, _ = layer.line.distance(np.moveaxis(position, 1, 0))
-        supports[f"ground {k}"] = away, layer.pressed(away, width)
+        supports[f"ground {k}"] = away - 0.5 * width, layer.bearing(away, width)
     for k, wall in enumerate(scene.walls):
         away = position[:, "xy".index(wall.axis)] - wall.position
         away = away if wall.solid_side == "below" else -away
@@ -73,9 +75,9 @@ def feet(motion: Motion) -> list[Foot]:
     i, j = index - index.min(axis=1, keepdims=True)
     near, along = np.ones((3, 3)), np.einsum("k,fkp->fp", scene.direction, position)
     found = []
-    for name, (distance, pressed) in supports.items():
-        depth = pressed * (motion.gamma[:half] >= 0.5)
-        often = depth.any(axis=0)
+    for name, (distance, depth) in supports.items():
+        depth = depth * (motion.gamma[:half] >= 0.5)
+        often = (depth > TOUCHES).any(axis=0)
         lattice = np.zeros((i.max() + 1, j.max() + 1), dtype=bool)
         lattice[i[often], j[often]] = True
         names = np.where(often, label(binary_dilation(lattice, near), near)[0][i, j], 0)

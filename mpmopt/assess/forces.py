@@ -213,7 +213,8 @@ class _Account:
     def __init__(self, simulation: Simulation) -> None:
         self.simulation, self.scene = simulation, simulation.scene
         scene = simulation.scene
-        self.layers, self.width = scene.layers, 0.0  # over which a layer's pressure is a mean
+        self.layers = scene.layers
+        self.width = 0.0  # of particles, over which a layer's pressure is a mean
         data, count = simulation.data, simulation.initial.shape[1]
         halves = 1 if scene.mirror is None else 2
 
@@ -271,7 +272,7 @@ class _Account:
         for force, layer in zip(forces, self.layers):
             d, normal = layer.line.distance(x)
             force[:] = self.stiffness * self.volume * layer.stiffness
-            force *= layer.pressed(d, self.width)
+            force *= layer.bearing(d, self.width)
             normals.append(normal)
         return forces, np.array(normals).reshape(-1, *x.shape)
 

@@ -8,12 +8,12 @@ import hashlib
 import logging
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
-import numba
 from numba import njit
-from numba.core.caching import IndexDataCacheFile
 from numba.core.registry import cpu_target
 
 
@@ -120,28 +120,24 @@ def is_to_compile(kernel: Any, arguments: tuple[Any, ...]) -> bool:
 
 
 def _stamped(kernel: Any) -> Any:
-    cache: Any = getattr(kernel, "_cache", None)
-    if hasattr(cache, "_cache_file"):  # the compiler and its cache are on
-        cache._cache_file = _CacheFile(cache._cache_path, cache._impl.filename_base, STAMP)
+    file: Any = getattr(getattr(kernel, "_cache", None), "_cache_file", None)
+    if hasattr(file, "_save_data"):  # the compiler and its cache are on, and Numba's own is this
+        file._source_stamp, file.save = STAMP, partial(_save, file)
     return kernel
 
 
-class _CacheFile(IndexDataCacheFile):
-    """What the disk keeps of a kernel: what the index names is what was compiled for it.
+def _save(file: Any, key: Any, data: Any) -> None:
+    """Keep a compiled kernel: data under a new name, then the index; remove what that leaves out.
 
-    Numba writes the index first, and the data under a name that others had before them. A process
-    that reads in between, or after one that was ended there, would run what was compiled of older
-    sources, by another version, or for other types.
+    Numba itself writes the index first, and the data under a name that others had before them. A
+    process that reads in between, or after one that was ended there, would run what was compiled of
+    older sources, by another version, or for other types.
     """
-
-    def save(self, key: Any, data: Any) -> None:
-        """Write data under a name of their own, then the index; remove what that does not name."""
-        of = repr((numba.__version__, STAMP, key)).encode()
-        name = self._data_name(int(hashlib.sha256(of).hexdigest()[:15], 16))
-        self._save_data(name, data)
-        overloads = {**self._load_index(), key: name}
-        self._save_index(overloads)
-        for path in Path(self._cache_path).glob(self._index_name.replace(".nbi", ".*.nbc")):
-            if path.name not in overloads.values():
-                with suppress(OSError):  # another process was faster, or reads it
-                    path.unlink()
+    name = file._data_name(uuid4().int >> 80)
+    file._save_data(name, data)
+    overloads = {**file._load_index(), key: name}
+    file._save_index(overloads)
+    for path in Path(file._cache_path).glob(file._index_name.replace(".nbi", ".*.nbc")):
+        if path.name not in overloads.values():
+            with suppress(OSError):  # another process was faster, or reads it
+                path.unlink()

@@ -450,9 +450,9 @@ def is_clear(x, y, lattice):
     i, j = math.floor(x / lattice.dx + 0.5), math.floor(y / lattice.dx + 0.5)
     if not (0 <= i < lattice.nodes_x and 0 <= j < lattice.nodes_y):
         return False
-    # No distance from that node is more than 0.71 cells, none changes by more than one goes, and
-    # what a particle is wide reaches half a cell at most.
-    return lattice.ground.clearance[i * lattice.nodes_y + j] > (SKIN + 1.25) * lattice.dx
+    # No distance from that node is more than 0.71 cells, and none changes by more than one goes.
+    reach = (SKIN + 0.75) * lattice.dx + 0.5 * math.sqrt(lattice.volume)
+    return lattice.ground.clearance[i * lattice.nodes_y + j] > reach
 
 
 @bare_loop_jit

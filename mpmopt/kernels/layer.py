@@ -1,7 +1,8 @@
 """The contact layer of ground: what bears a particle, and what resists the nodes that it moves.
 
 The laws are functions of numbers: `bearing` of a particle at a distance d from ground, `resistance`
-of the velocity of a node to which the layer gives momentum. `press` applies the first.
+of the velocity of a node to which the layer gives momentum. `press` applies the first; in the total
+Lagrangian formulation `lagrangian.press` applies `mean_bearing`.
 """
 
 import math
@@ -50,9 +51,9 @@ def reach(d, thickness, width):
 
 @jit
 def mean_bearing(d, thickness, width, capacity):
-    """Mean of `bearing` over places within width/2 of d, as the narrower particles of finer cells.
+    """Mean of `bearing` over places within width/2 of d: what narrower particles add up to.
 
-    So the force does not depend on where in a layer a row of particles lies, and rises smoothly.
+    So a flat foot has the force that it has on the finest cells, wherever its rows lie.
     """
     deepest, inside = reach(d, thickness, width)
     return capacity * inside * (deepest - 0.5 * inside) / (width * thickness)
@@ -70,7 +71,8 @@ def mean_bearing_adjoint(d, thickness, width, capacity, b_bar):
 def rise(x, y, margin, parameters):
     """How fast layers' forces on solid at a place rise with depth: the sum of kappa / thickness.
 
-    Of those layers that are within a margin.
+    Layers count that begin within a margin, which for `mean_bearing` is half a width: it rises no
+    faster.
     """
     ground, found = parameters.ground, 0.0
     i, j = round(x * parameters.per_dx), round(y * parameters.per_dx)

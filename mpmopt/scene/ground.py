@@ -315,17 +315,17 @@ class Layer(NamedTuple):
             creeping_speed=CREEPING * speed if creeping is None else creeping,
         )
 
-    def pressed(self, d: Array, width: float) -> Array:
-        """`kernels.mean_bearing` of a capacity of one; of a width of zero, `kernels.bearing`."""
+    def bearing(self, d: Array, width: float) -> Array:
+        """Force over capacity of particles at d: the mean over their width, which may be zero."""
         if width == 0.0:
             return np.maximum(1.0 - d / self.thickness, 0.0)
         deepest, inside = self._reach(d, width)
         return inside * (deepest - 0.5 * inside) / (width * self.thickness)
 
     def stored(self, d: Array, width: float) -> Array:
-        """The energy of which `pressed` is the force."""
+        """The energy of which `bearing` is the force."""
         if width == 0.0:
-            return 0.5 * self.thickness * self.pressed(d, width) ** 2
+            return 0.5 * self.thickness * self.bearing(d, width) ** 2
         deepest, inside = self._reach(d, width)
         return (deepest**3 - (deepest - inside) ** 3) / (6.0 * width * self.thickness)
 
