@@ -47,7 +47,11 @@ def test_feet_are_neighbours_that_touch_and_stand_in_a_row():
 
 def test_a_lattice_touches_with_its_edge_and_not_by_rounding():
     # Particles are half a cell wide: the second reaches a tenth of one into the layer.
-    motion = moving([(1.5, 1.5, 1.25, 1.5), (1.5, 1.15, 1.25, 1.25)], formulation="total")
+    motion = moving(
+        [(1.5, 1.5, 1.2499, 1.5), (1.5, 1.15, 1.25, 1.25)],
+        (0.0, 1.0, 2.0, 7.0),
+        formulation="total",
+    )
     (foot,) = feet(motion)
     assert foot.particles.tolist() == [1]
     assert foot.height * 16 == pytest.approx([1.25, 0.9])

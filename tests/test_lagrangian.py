@@ -458,3 +458,26 @@ def test_states_are_looked_at_once_whatever_the_segments(segment):
         last = min(first + segment, steps)
         seen += [first + slot for slot in looked_at(first, last, steps, 64)]
     assert seen == [0, 64, 128, 192, 200]
+
+
+@pytest.mark.parametrize("per_cell", [1, 2])
+@pytest.mark.parametrize(
+    "points",
+    [
+        ((0.0, 4 * C), (1.0, 4 * C)),
+        ((0.0, 0.5 * C), (1.0, 3.6 * C)),
+        ((0.0, 0.0), (6.2 * C, 3.4 * C), (1.0, 0.0)),
+    ],
+)
+def test_what_a_layer_reaches_within_a_skin_is_never_clear(rng, points, per_cell):
+    ground = Ground(points, thickness=C)
+    scene = lattice_scene(ground=(ground,), particles_per_cell=per_cell)
+    particles = discretise(scene)
+    lattice = LagrangianSimulation(
+        scene, particles, *material_of(particles), np.zeros((60, 2))
+    ).lattice
+    places = C * rng.uniform(1.0, 14.0, (2, 4000))
+    away = scene.layers[0].line.distance(places)[0] - C - 0.5 * C / per_cell
+    clear = [kernels.plain(lagrangian.is_clear)(x, y, lattice) for x, y in places.T]
+    assert not np.any(clear & (away < lagrangian.SKIN * C))
+    assert np.all(np.array(clear)[away > (lagrangian.SKIN + 1.5) * C])
