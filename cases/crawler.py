@@ -47,8 +47,8 @@ def crawler(cells: int, time_step: float, mirror: bool = True) -> Scene:
 def crawler_on_ground(cells: int, time_step: float, seconds: float) -> Scene:
     """The same body in a longer channel with layers, and with a frequency that is designed too.
 
-    Its layers squeeze the body a little, so that it does not coast. What comes in the first second
-    does not count.
+    Its layers squeeze the body a little, so that it does not coast; MLS-MPM's particles, which feel
+    them at their middles, from 128 cells on. What comes in the first second does not count.
     """
     c = 1 / 64
     scene = crawler(cells, time_step)
