@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 from conftest import worst
 
-from mpmopt.app.summary import summarise
-from mpmopt.assess import refinement, robustness, threshold
 from mpmopt.assess.threshold import distance, kept
 from mpmopt.assess.verify import complex_step_test
 from mpmopt.design.problem import Problem
@@ -17,7 +15,6 @@ from mpmopt.design.terms import Displacement, Effort, OnePiece, Volume
 from mpmopt.design.variation import Variation
 from mpmopt.errors import DesignError
 from mpmopt.optimisation.loop import begin, go_on, optimise
-from mpmopt.optimisation.presets import then_finer
 from mpmopt.optimisation.settings import Settings, Stage
 from mpmopt.results.runfile import read_run, write
 from mpmopt.scene import Actuator, Design, Grid, Ground, Material, Scene, Solid
@@ -204,55 +201,3 @@ def test_json_and_back():
         TASK, scenes=(*SCENES, Variation(ground=(Ground.floor(0.1, friction="stick"),)))
     )
     assert Task.from_json(task.to_json()) == task
-
-
-def test_a_late_stage_has_finer_cells_and_the_robot_is_of_it(x, tmp_path):
-    last = dataclasses.replace(SETTINGS.stages[-1], most_iterations=1)
-    settings = then_finer(dataclasses.replace(SETTINGS, stages=(last,)), (0, 2), 1)
-    early, _ = settings.stages
-    assert early == last
-    run = optimise(SCENE, settings, x, task=dataclasses.replace(TASK, subject_to=()))
-    for item, times in zip(run.history, (1, 2), strict=True):
-        varied = (dataclasses.replace(TASK.scenes[k], refinement=times) for k in (0, 2))
-        first, third = varied
-        scenes = first, TASK.scenes[1], third
-        there = early.problem(SCENE, task=dataclasses.replace(run.task, scenes=scenes))
-        assert there.value(run.best[item.stage].x) == item.objective
-        assert [each.value(run.best[item.stage].x) for each in there.members] == [*item.scenes]
-    run.best[0] = dataclasses.replace(run.best[0], post_processed=1.0)  # on wide cells
-    assert run.result is run.best[1]
-    assert run.problem().value(run.result.x) == run.result.objective
-    write(tmp_path / "run.h5", run)
-    assert read_run(tmp_path / "run.h5").run.settings == settings
-
-
-def test_a_summary_compares_in_the_scenes_of_the_best_designs_stage(x, monkeypatch):
-    """The block, the baseline and the body without grey: all on the finer cells."""
-    asked = []
-
-    def distance(scene, keep, variables, task):
-        asked.append([each.refinement for each in task.scenes])
-        return 0.1
-
-    for module in (threshold, refinement):
-        monkeypatch.setattr(module, "distance", distance)
-    monkeypatch.setattr(robustness, "study", lambda *_: {})
-    stage = Stage(4.0, 1e-2, 1e-2, 2e-3, finer=(0, 2), solid=True, most_iterations=1)
-    run = optimise(SCENE, Settings((stage,)), x, task=dataclasses.replace(TASK, subject_to=()))
-    asked.clear()
-    block = summarise(run, np.ones(len(run.result.gamma), dtype=bool))
-    assert (block["reference"], block["baseline"]) == (0.1, 0.1)
-    assert len(asked) > 8
-    assert all(each == [2, 1, 2] for each in asked)
-
-
-def test_finer_scenes_are_scenes_of_the_task():
-    settings = Settings((Stage(2.0, finer=(3,)),))
-    with pytest.raises(DesignError, match=r"\(3,\) names scene 3, the task has scenes 0 to 2"):
-        begin(SCENE, settings, {}, TASK)
-    with pytest.raises(DesignError, match="give the task scenes"):
-        begin(SCENE, settings, {}, Task())
-    with pytest.raises(DesignError, match=r"finer = \(0, 1, 0\) names scene 0 twice; name it once"):
-        Stage(2.0, finer=(0, 1, 0))
-    with pytest.raises(DesignError, match="finer = -1"):
-        Stage(2.0, finer=(-1,))

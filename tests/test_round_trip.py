@@ -34,7 +34,6 @@ def distinct(kind, **given):
                 "float": lambda n=n: 1.0 / n,
                 "float | None": lambda n=n: 1.0 / n,
                 "tuple[float, ...]": lambda n=n: (1.0 / n, -float(n)),
-                "tuple[int, ...]": lambda n=n: (n, 2 * n),
                 "str": lambda n=n: f"text {n}",
                 "bool": lambda field=field: field.default is not True,
                 "NDArray[np.float64]": lambda n=n: 1.0 / (n + np.arange(3.0)),

@@ -42,9 +42,8 @@ def summarise(
 
     The baseline (D,) is that of `baseline_particles`, or none.
 
-    Reference designs count with the better of the first and the best design's actuation, in the
-    scenes of the best design's stage (`Stage.finer`), as all but the start do. The cost of
-    transport is that of the post-processed design, over all of its travel.
+    Reference designs count with the better of the first and the best design's actuation. The cost
+    of transport is that of the post-processed design, over all of its travel.
     """
     instance("summarise", "result", result, Optimisation)
     best, problem = result.result, result.problem()
@@ -54,7 +53,7 @@ def summarise(
     actuations = [Variables.of(item.x, problem.scene) for item in (first, best)]
     actuation = actuations[1]
     reference = _value_or_none(
-        lambda: best_actuated(problem.scene, solid_reference, *actuations, task=problem.task)
+        lambda: best_actuated(problem.scene, solid_reference, *actuations, task=result.task)
     )
     block = np.nan if reference is None else reference
 
@@ -67,7 +66,7 @@ def summarise(
         "baseline": None
         if baseline is None
         else _value_or_none(
-            lambda: best_actuated(problem.scene, lambda _: baseline, *actuations, task=problem.task)
+            lambda: best_actuated(problem.scene, lambda _: baseline, *actuations, task=result.task)
         ),
         "optimised": best.objective,
         # The row has none where the reference failed.

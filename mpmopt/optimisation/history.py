@@ -204,9 +204,8 @@ class Optimisation:
         """The best evaluation.
 
         That is, of the best of each stage, the one that goes farthest without void, but one of a
-        stage with finer scenes comes before all others, and one of a refined stage before the
-        rest, however far those go; without void none may count, then it is that of the last stage.
-        Those that meet the constraints come first.
+        refined stage comes before the rest, however far those go; without void none may count, then
+        it is that of the last stage. Those that meet the constraints come first.
 
         Raises
         ------
@@ -218,10 +217,9 @@ class Optimisation:
             raise DesignError(f"there is no design: no evaluation succeeded yet{last}")
         stages = self.settings.stages
 
-        def merit(item: Candidate) -> tuple[float, int, float, int]:
-            stage = stages[item.stage]
-            rank = 2 * bool(stage.finer) + stage.refined if np.isfinite(item.counted) else 0
-            return -item.violation, rank, item.counted, item.stage
+        def merit(item: Candidate) -> tuple[float, bool, float, int]:
+            refined = stages[item.stage].refined and np.isfinite(item.counted)
+            return -item.violation, bool(refined), item.counted, item.stage
 
         return max(self.best.values(), key=merit)
 

@@ -95,8 +95,6 @@ def begin(scene: Scene, settings: Settings, start: Any, task: Task = DEFAULT_TAS
     instance("optimise", "scene", scene, Scene)
     instance("optimise", "settings", settings, Settings, HOW)
     scenes = [stage.scene(scene) for stage in settings.stages]
-    for stage in settings.stages:
-        stage.task(task)
     first = Problem(scenes[0], task=task)
     if first.size == 0:
         raise DesignError("there is nothing to design: give a Design or an Actuator")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,19 +59,6 @@ def gait(most_iterations: int, move_limit: float = 0.02) -> Settings:
         tolerance=0.0,
         most_iterations=most_iterations,
     )
-
-
-def then_finer(settings: Settings, scenes: tuple[int, ...], most_iterations: int) -> Settings:
-    """The same, and a stage like its last one in which some of the task's scenes are finer.
-
-    So that the robot keeps its speed on finer cells: from a finished one it mends that, from the
-    start it finds slower ones. The stage begins at the design that went farthest as it is, and its
-    best design is the run's, whatever earlier ones reach on wide cells (`Optimisation.result`).
-    Designs are not refined once more there.
-    """
-    *_, last = settings.stages
-    late = replace(last, refined=False, finer=scenes, most_iterations=most_iterations)
-    return replace(settings, stages=(*settings.stages, late))
 
 
 def paper_preset(time_step: float) -> Settings:

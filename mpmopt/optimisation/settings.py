@@ -53,9 +53,6 @@ class Stage(Checked):
         Whether such a design counts with the least of this and of the same with half the step and
         with cells half as wide (`refinement.least`), so that the best is one that keeps its gain.
         This costs four gradients more for each design that goes farther than the best so far.
-    finer : tuple of int
-        Numbers, from 0, of the task's scenes that have cells half as wide in this stage: a late
-        stage with one, so that the robot keeps its speed on finer cells.
     move_limit : float
         Greatest step of a variable, as a fraction of its range.
     void_cutoff : float
@@ -83,7 +80,6 @@ class Stage(Checked):
     time_step: float | None = None
     solid: bool = False
     refined: bool = False
-    finer: tuple[int, ...] = ()
     move_limit: float = 0.05
     void_cutoff: float = 0.0
     most_iterations: int | None = None
@@ -101,13 +97,6 @@ class Stage(Checked):
         _take(self, flag, "solid refined limited subpixel")
         if self.refined and not self.solid:
             raise DesignError("Stage: refined = True needs solid = True")
-        given: Any = self.finer
-        numbers = tuple(given) if isinstance(given, Iterable) else (given,)
-        finer = tuple(count("Stage", "finer", k, 0, error=DesignError) for k in numbers)
-        for k in finer:
-            if finer.count(k) > 1:
-                raise DesignError(f"Stage: finer = {finer} names scene {k} twice; name it once")
-        object.__setattr__(self, "finer", finer)
         _take(self, count, "most_iterations", least=1)
         _take(self, count, "halvings", least=0)
 
@@ -119,25 +108,6 @@ class Stage(Checked):
             void_density=density if self.void_density is None else self.void_density,
             void_stiffness=stiffness if self.void_stiffness is None else self.void_stiffness,
         )
-
-    def task(self, task: Task) -> Task:
-        """The task as this stage solves it: with some of its scenes `finer`.
-
-        Raises
-        ------
-        DesignError
-            If it has no scene of such a number.
-        """
-        scenes = list(task.scenes)
-        for k in self.finer:
-            if k >= len(scenes):
-                there = f"the task has scenes 0 to {len(scenes) - 1}"
-                raise DesignError(
-                    f"Stage: finer = {self.finer} names scene {k}, "
-                    f"{there if scenes else 'the task has none: give the task scenes'}"
-                )
-            scenes[k] = dataclasses.replace(scenes[k], refinement=2 * scenes[k].refinement)
-        return dataclasses.replace(task, scenes=tuple(scenes))
 
     def problem(
         self,
@@ -155,7 +125,7 @@ class Stage(Checked):
             self.void_cutoff,
             self.halvings,
             LIMITS if self.limited else None,
-            task=self.task(task),
+            task=task,
             subpixel=self.subpixel,
         )
 
