@@ -588,16 +588,18 @@ class Cost:
 def cost(points: Sequence[Point], level: float, error: str = "distance_error") -> Cost | None:
     """The least that some points take to be off by at most so much, and not by chance.
 
-    All with finer cells must be so too, as in `discretisation.cheapest`. Between two numbers of
-    cells errors and costs are taken as powers of the cells, so that none is favoured by the cells
-    that were chosen.
+    All with finer cells must be so too, as in `discretisation.cheapest`, up to the finest of all: a
+    step that these do not bear shows by nothing that it is right. Between two numbers of cells
+    errors and costs are taken as powers of the cells, so that none is favoured by the cells that
+    were chosen.
     """
     lines: dict[tuple[float, str], list[Point]] = {}
     for point in sorted(points, key=lambda p: p.n):
         if point.choice not in PEERS and point.measured.seconds > 0.0:
             lines.setdefault((point.courant, point.choice), []).append(point)
     found = []
-    for line in lines.values():
+    finest = max((line[-1].n for line in lines.values()), default=0)
+    for line in (each for each in lines.values() if each[-1].n == finest):
         errors = [getattr(point, error) for point in line]
         first = len(line)
         while first > 0 and errors[first - 1] <= level:

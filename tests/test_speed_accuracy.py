@@ -109,14 +109,15 @@ def test_every_resolution_sees_the_same_robot(name):
 
 
 def test_the_time_at_equal_accuracy_is_of_points_that_are_not_right_by_chance():
-    def point(n, seconds, error, choice=PLAIN, scene="bar"):
+    def point(n, seconds, error, choice=PLAIN, courant=0.4):
         here = Discretisation((n, n), 1, formulation=choice.formulation)
         measured = Measured(here, seconds, distance=1.0)
-        return Point(scene, n, 1, 0.4, choice.name, measured, distance_error=error)
+        return Point("bar", n, 1, courant, choice.name, measured, distance_error=error)
 
     points = [
         point(32, 1.0, 0.009), point(64, 4.0, 0.1), point(128, 16.0, 0.01),
         point(32, 0.5, 0.2, TOTAL), point(64, 2.0, 0.01, TOTAL), point(128, 8.0, 0.002, TOTAL),
+        point(64, 0.1, 0.001, courant=0.6),  # a step that no finer cells bear
     ]  # fmt: skip
     rows = {row["off by at most"]: row for row in at_equal_accuracy(points, {"bar": (0.003, 1.0)})}
     assert rows["20 %"]["times"] == "2.0"  # 1 s and 0.5 s
