@@ -28,7 +28,7 @@ VISCOSITY = 0.03  # of the cases in the total Lagrangian formulation
 HEAVY = 1e-2  # the void density that is the cure
 SAFE_STIFFNESS = 1e-3
 # In the total Lagrangian formulation, with a void density of ten times the void stiffness.
-SAFE_TOTAL_COURANT, SAFE_TOTAL_STIFFNESS = 0.35, (1e-4, 1e-3)
+SAFE_TOTAL_COURANT, SAFE_TOTAL_STIFFNESS = 0.25, (1e-4, 1e-3)
 GAIN = 0.25  # of an optimised walker: deviations are judged by it
 
 
