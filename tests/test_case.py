@@ -98,7 +98,7 @@ def test_a_small_climber_climbs_even_without_its_void(tmp_path):
     settings = dataclasses.replace(SMALL.settings, least_iterations=10, most_iterations=10)
     case = Case(climber.climber(64, 8e-4, 2.0), settings, climber.three_pairs, climber.START)
     summary = run(case, tmp_path)
-    assert summary["start"] <= 30 / 64  # where it is put: it sags
+    assert summary["start"] == pytest.approx(30 / 64, abs=0.005)  # it stays where it is put
     assert summary["optimised"] - summary["reference"] >= 0.02
     assert summary["post_processed"] - summary["reference"] >= 0.015
     assert summary["disconnected_particles"] == 0
