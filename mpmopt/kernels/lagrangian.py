@@ -447,12 +447,17 @@ def value_adjoint(rows, fields, b, lattice, nodes, first):
 @bare_jit
 def is_clear(x, y, lattice):
     """Whether a particle at (x, y) stays off the layers until it has moved by `SKIN` cells."""
+    ground, reach = lattice.ground, SKIN * lattice.dx + 0.5 * math.sqrt(lattice.volume)
     i, j = math.floor(x / lattice.dx + 0.5), math.floor(y / lattice.dx + 0.5)
-    if not (0 <= i < lattice.nodes_x and 0 <= j < lattice.nodes_y):
-        return False
-    # No distance from that node is more than 0.71 cells, and none changes by more than one goes.
-    reach = (SKIN + 0.75) * lattice.dx + 0.5 * math.sqrt(lattice.volume)
-    return lattice.ground.clearance[i * lattice.nodes_y + j] > reach
+    known = 0 <= i < lattice.nodes_x and 0 <= j < lattice.nodes_y
+    # No place is more than 0.71 cells from its node.
+    if known and ground.clearance[i * lattice.nodes_y + j] > reach + 0.75 * lattice.dx:
+        return True
+    for m in range(len(ground.layers)):
+        d, _, _, _ = distance(x, y, ground, m)
+        if d <= ground.layers[m, THICKNESS] + reach:
+            return False
+    return True
 
 
 @bare_loop_jit
