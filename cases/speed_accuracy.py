@@ -42,7 +42,7 @@ from matplotlib.artist import Artist
 from matplotlib.patches import Rectangle
 
 from mpmopt.app.sweeps import connected, results, sweep
-from mpmopt.assess.discretisation import Discretisation, Measured, density, measure, timed
+from mpmopt.assess.discretisation import Discretisation, Measured, density, measure, sums, timed
 from mpmopt.design.actuation import signal_adjoint
 from mpmopt.design.objective import Objective
 from mpmopt.design.problem import Problem
@@ -160,11 +160,8 @@ def in_patches(scene: Scene, gradient: np.ndarray) -> np.ndarray:
     used = np.flatnonzero(gradient[: nx * ny])
     centres = scene.grid.dx * (np.stack(np.divmod(used, ny), axis=1) + 0.5)
     places, weights = blur(scene, centres)
-    columns, rows = (math.ceil(side / PATCH - 1e-6) for side in scene.grid.size)
-    i, j = np.floor(places / PATCH).astype(int).transpose(2, 0, 1)
-    shares = weights * gradient[used]
-    sums = np.bincount((i * rows + j).ravel(), shares.ravel(), columns * rows)
-    return np.concatenate([sums, gradient[nx * ny :]])
+    before = sums(scene, places, weights * gradient[used], PATCH)
+    return np.concatenate([before, gradient[nx * ny :]])
 
 
 @dataclass(frozen=True)

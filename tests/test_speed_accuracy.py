@@ -104,7 +104,6 @@ def test_every_resolution_sees_the_same_robot(name):
         volume = problem.particles.volume[problem.particles.designed]
         mass.append(gamma @ volume / volume.sum())
     assert 0.2 < mass[-1] < 0.8
-    # The filter is as wide as the cells are, so it blurs less on finer grids.
     assert max(mass) / min(mass) <= 1.03
 
 

@@ -207,10 +207,18 @@ def density(
     if plane is not None:
         across = position[:, plane.normal]
         position[:, plane.normal] = np.minimum(across, 2.0 * plane.position - across)
-    columns, rows = (math.ceil(side / patch - 1e-6) for side in problem.scene.grid.size)
-    i, j = np.floor(position / patch).astype(int).T
     phi, *actuation = Variables.of(gradient, problem.scene)
-    return np.concatenate([np.bincount(i * rows + j, phi, columns * rows), *actuation])
+    return np.concatenate([sums(problem.scene, position, phi, patch), *actuation])
+
+
+def sums(
+    scene: Scene, position: NDArray[np.float64], values: NDArray[np.float64], patch: float
+) -> NDArray[np.float64]:
+    """Sums of values (...) at positions (..., 2) over squares of a width, of the whole grid."""
+    columns, rows = (math.ceil(side / patch - 1e-6) for side in scene.grid.size)
+    i, j = np.moveaxis(np.floor(position / patch).astype(int), -1, 0)
+    found: Any = np.bincount((i * rows + j).ravel(), values.ravel(), columns * rows)
+    return found
 
 
 def timed(run: Callable[[], Any], repeats: int = 1) -> tuple[Any, float]:
