@@ -1,5 +1,6 @@
 """Progress: a bar on a terminal, lines elsewhere, results never mixed with either."""
 
+import gc
 import os
 import struct
 import subprocess
@@ -35,6 +36,16 @@ def test_where_the_end_is_not_known_there_is_a_line_every_ten(capsys):
             progress.step()
     lines = capsys.readouterr().err.splitlines()
     assert [line.split(",")[0] for line in lines] == ["10 gradients", "20 gradients"]
+
+
+def test_a_bar_that_is_interrupted_while_it_is_made_adds_nothing_to_the_advice(monkeypatch):
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("tqdm.tqdm.__init__", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        Progress("steps")
+    gc.collect()  # an error while the bar is removed would be a warning here
 
 
 def on_a_terminal(work, columns=80):

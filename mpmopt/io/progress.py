@@ -20,6 +20,12 @@ from mpmopt.io.notebook import Line, in_notebook
 LINES = 10  # of a work whose size is known; of another, one in so many steps
 
 
+class _Bar(tqdm):  # type: ignore[misc]
+    """A bar that has nothing to remove if a Ctrl-C comes while it is made."""
+
+    disable = True  # what tqdm's own, below 4.70, has no value for until then
+
+
 class Progress:
     """A bar that shows steps of work; off terminals and notebooks, a line now and then.
 
@@ -49,7 +55,7 @@ class Progress:
         stream: Any = Line() if below_cell else sys.stderr
         terminal = not below_cell and stream is not None and stream.isatty()
         self._stream = stream
-        self._bar = tqdm(
+        self._bar = _Bar(
             total=total,
             unit=f" {unit}",
             disable=not (below_cell or terminal),
