@@ -3,7 +3,7 @@
     python cases/optimisers.py --out DIR
 
 Each takes as many evaluations, from the case's own start and from random ones
-(`multistart.disturbed`). Leaves the run file of each run, and ``optimisers.csv``: speeds of the
+(`starts.disturbed`). Leaves the run file of each run, and ``optimisers.csv``: speeds of the
 finished robots without grey. What was stopped goes on.
 """
 
@@ -16,7 +16,6 @@ from typing import Any
 
 import walker
 
-from mpmopt.app.multistart import disturbed
 from mpmopt.app.sweeps import as_csv
 from mpmopt.assess.robustness import Robot, Trial, speed
 from mpmopt.design.task import Task
@@ -28,6 +27,7 @@ from mpmopt.io.progress import Progress
 from mpmopt.optimisation.history import Optimisation
 from mpmopt.optimisation.loop import begin, go_on
 from mpmopt.optimisation.settings import Settings, Stage
+from mpmopt.optimisation.starts import disturbed
 from mpmopt.results import runfile
 
 CASE = walker.CASES["preview"]

@@ -112,7 +112,7 @@ TASK = Task(
 )
 
 CASES = {
-    "default": Case(walker_on_ground(64, 1e-3, 4.0), gait(100), two_legs, START, TASK),
+    "default": Case(walker_on_ground(64, 1e-3, 4.0), gait(60, starts=3), two_legs, START, TASK),
     "preview": Case(walker_on_ground(64, 1e-3, 3.0), gait(40), two_legs, START, TASK),
     "paper": Case(walker(128, 2e-4), paper_preset(2e-4), slanted_legs),
 }

@@ -12,10 +12,12 @@ from mpmopt.assess import refinement
 from mpmopt.design import chain
 from mpmopt.design.problem import Problem
 from mpmopt.design.task import DEFAULT_TASK
+from mpmopt.design.variables import Frozen
 from mpmopt.errors import DesignError, SceneError, SimulationError
 from mpmopt.optimisation.history import Candidate, Optimisation
 from mpmopt.optimisation.loop import go_on, optimise
 from mpmopt.optimisation.settings import Settings, Stage
+from mpmopt.optimisation.starts import random_start
 
 STAGES = (Stage(0.5, 1e-2, 1e-3, 4e-3), Stage(2.0, 5e-3, 1e-3, 2e-3, solid=True))
 QUICK = Settings(STAGES, least_iterations=12, most_iterations=15)
@@ -106,6 +108,22 @@ def test_a_stage_hands_its_farthest_design_to_the_next(scene, start, monkeypatch
     assert incumbent is not run.best[0]
     assert np.array_equal(second.x, incumbent.x)
     assert second.step == 0.0
+
+
+def test_a_disturbed_stage_begins_at_the_first_design_with_a_field_added(scene, start):
+    stages = tuple(dataclasses.replace(STAGES[1], disturbed=seed) for seed in (None, 3, 4))
+    task = dataclasses.replace(DEFAULT_TASK, variables=(Frozen("b"),))
+    candidates: list[Any] = []
+    settings = Settings(stages, most_iterations=3)
+    run = optimise(scene, settings, start, lambda run: candidates.append(run.last), task=task)
+    problem = run.problem()
+    where = problem.particles.position[problem.particles.designed]
+    begun = [item.x for item in candidates[::3]]
+    assert np.array_equal(begun[0], start)
+    for x, seed in zip(begun[1:3], (3, 4), strict=True):
+        field = np.clip(random_start(scene, seed)(where), -1.0, 1.0)
+        assert np.array_equal(x, np.concatenate([field, start[len(where) :]]))
+    assert run.result.counted == max(item.counted for item in run.best.values())
 
 
 def test_the_moving_average_ends_a_stage(scene, start):

@@ -9,12 +9,13 @@ from conftest import small_scene
 from exact import at_rest, solid_simulation
 
 from mpmopt import __main__ as commands
-from mpmopt.app.multistart import random_start, report
+from mpmopt.app.multistart import report
 from mpmopt.app.summary import summarise, table
 from mpmopt.assess import threshold
 from mpmopt.design.problem import Problem
 from mpmopt.optimisation.loop import optimise
 from mpmopt.optimisation.settings import Settings, Stage
+from mpmopt.optimisation.starts import random_start
 from mpmopt.results import runfile
 from mpmopt.scene import Actuator, Grid, Ground, Material, Solid
 from mpmopt.scene.particles import discretise

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mpmopt.app.case import RESULTS, Case, baseline_particles, draw_or_warn, run
 from mpmopt.app.sweeps import as_csv, connected, sweep
@@ -23,59 +22,12 @@ from mpmopt.errors import RunFileError, SweepError
 from mpmopt.io.files import locked, make_folder, refuse_existing, replace_file
 from mpmopt.optimisation.loop import check_body_fits
 from mpmopt.optimisation.settings import Settings
+from mpmopt.optimisation.starts import disturbed
 from mpmopt.results import runfile
-from mpmopt.scene import Design, Scene
+from mpmopt.scene import Scene
 from mpmopt.validation import count, digits, instance, place
 
 logger = logging.getLogger(__name__)
-
-AMPLITUDE = 0.3  # standard deviation of a start's phi
-LENGTH = 0.15  # its correlation length, in longest sides of the design domain
-WAVES = 64
-
-
-def random_start(scene: Scene, seed: int) -> Callable[[NDArray], NDArray[np.float64]]:
-    """A smooth random field phi, the same on every grid.
-
-    A sum of plane waves, phi = A sqrt(2 / W) sum_w cos(k_w . x + p_w), with Gaussian k_w and
-    uniform p_w: nearly a Gaussian field with covariance A^2 exp(-r^2 / (2 l^2)) (Shinozuka and
-    Deodatis, Applied Mechanics Reviews 44, 1991, 191), where l is `LENGTH` times the longest side
-    of the design domain and A is `AMPLITUDE`. What is beyond [-1, 1] is cut off.
-
-    Parameters
-    ----------
-    scene : Scene
-    seed : int
-
-    Returns
-    -------
-    callable
-        From positions (D, 2) to phi (D,).
-    """
-    corners = np.array([(r.lower, r.upper) for r in scene.body if isinstance(r, Design)])
-    sides = np.ptp(corners, axis=(0, 1)) if len(corners) else np.ones(2)
-    rng = np.random.default_rng(seed)
-    waves = rng.standard_normal((2, WAVES)) / (LENGTH * sides.max())
-    phase = rng.uniform(0.0, 2.0 * np.pi, WAVES)
-
-    def field(position: NDArray) -> NDArray[np.float64]:
-        total = np.cos(position @ waves + phase).sum(axis=1)
-        return np.clip(AMPLITUDE * math.sqrt(2.0 / WAVES) * total, -1.0, 1.0)
-
-    return field
-
-
-def disturbed(
-    phi: NDArray | Callable[[NDArray], NDArray], scene: Scene, seed: int
-) -> Callable[[NDArray], NDArray[np.float64]]:
-    """A start's phi, an array or a function, with a `random_start` added; within [-1, 1]."""
-    noise = random_start(scene, seed)
-
-    def field(position: NDArray) -> NDArray[np.float64]:
-        own = phi(position) if callable(phi) else phi
-        return np.clip(own + noise(position), -1.0, 1.0)
-
-    return field
 
 
 def one_start(

@@ -21,6 +21,7 @@ from mpmopt.errors import DesignError, SceneError, SimulationError
 from mpmopt.optimisation.history import Candidate, Iteration, Optimisation, StageState
 from mpmopt.optimisation.mma import MovingAsymptotes
 from mpmopt.optimisation.settings import DEFAULT_SETTINGS, Settings
+from mpmopt.optimisation.starts import disturbed
 from mpmopt.scene import Scene
 from mpmopt.simulation.checkpoints import Checkpointing
 from mpmopt.simulation.indicators import Indicators
@@ -274,7 +275,7 @@ class _Ascent:
         Returns the design that the next stage starts from, why it stopped, and whether to give up.
         """
         if self.run.stage_state is None:
-            self._evaluate(self.run.x)
+            self._evaluate(self._first())
         while True:
             assert self.run.last is not None
             x, reason = self.run.last.x, self._stop_reason()
@@ -286,6 +287,15 @@ class _Ascent:
                 return self.incumbent.x, reason, False
             else:
                 return x, reason, False
+
+    def _first(self) -> NDArray[np.float64]:
+        """The design that the stage begins with."""
+        run, seed, problem = self.run, self.stage.disturbed, self.problem
+        if seed is None:
+            return run.x
+        start = problem.split(run.first.x if run.first else run.x)
+        phi = disturbed(start.phi, run.scene, seed)
+        return self.freedom.started(problem.join(**start._replace(phi=phi)._asdict()))
 
     def _step(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """The design to evaluate after x."""

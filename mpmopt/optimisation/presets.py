@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,7 @@ from mpmopt.optimisation.settings import Settings, Stage
 # Robots end at 0.3 to 0.6 of the solid reference design's; a loose piece takes a thousandfold, but
 # small corners only little.
 IN_ONE_PIECE = AtMost(OnePiece(), -0.4)
+SEED = 1000  # of the starts of a gait, which are others than those of `--starts`
 
 
 def black_and_white(drawing: Callable[[NDArray], NDArray]) -> Callable[[NDArray], NDArray]:
@@ -43,17 +45,21 @@ def continuation(time_step: float | None = None, most_iterations: int = 25) -> S
     )
 
 
-def gait(most_iterations: int, move_limit: float = 0.02) -> Settings:
-    """One stage of plain moving asymptotes with short moves, black and white from the first design.
+def gait(most_iterations: int, move_limit: float = 0.02, starts: int = 1) -> Settings:
+    """Plain moving asymptotes with short moves, black and white from the first design.
 
     Its edges are as wide as a particle, so that no grey is there whose gain could be lost. A
     design counts without its void, by the lesser objective with half the step and with cells half
     as wide, so the best is at least as good as the start, which is a drawing that strides. It needs
     contact layers, finite friction and viscosity, with which distance is smooth. It also needs the
     total Lagrangian formulation, whose void may be light. Several actuators need shorter moves.
+
+    Where an ascent ends is a matter of luck, or of rounding. The best of several, each from the
+    start with another random field added, is less so: one stage each, the first from the start.
     """
+    stage = Stage(100.0, solid=True, refined=True, move_limit=move_limit, subpixel=True)
     return Settings(
-        (Stage(100.0, solid=True, refined=True, move_limit=move_limit, subpixel=True),),
+        (stage, *(replace(stage, disturbed=SEED + k) for k in range(1, starts))),
         adapt_move_limit=False,
         sharpen_asymptotes=False,
         tolerance=0.0,

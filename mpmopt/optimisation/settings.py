@@ -67,6 +67,9 @@ class Stage(Checked):
     subpixel : bool
         Whether edges of the design are at least as wide as a particle, however large beta is
         (`projection.project_subpixel`); with a large one, such as 100, the rest is black and white.
+    disturbed : int, optional
+        Begin at the run's first design with the `starts.random_start` of this seed added to its
+        phi, instead of where the stage before ended.
 
     Raises
     ------
@@ -86,6 +89,7 @@ class Stage(Checked):
     halvings: int = 2
     limited: bool = True
     subpixel: bool = False
+    disturbed: int | None = None
 
     def __post_init__(self) -> None:
         _take(self, number, "beta void_density void_stiffness time_step move_limit", above=0.0)
@@ -98,7 +102,7 @@ class Stage(Checked):
         if self.refined and not self.solid:
             raise DesignError("Stage: refined = True needs solid = True")
         _take(self, count, "most_iterations", least=1)
-        _take(self, count, "halvings", least=0)
+        _take(self, count, "halvings disturbed", least=0)
 
     def scene(self, scene: Scene) -> Scene:
         """The scene as this stage simulates it."""
