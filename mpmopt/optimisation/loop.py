@@ -295,7 +295,7 @@ class _Ascent:
             return run.x
         start = problem.split(run.first.x if run.first else run.x)
         phi = disturbed(start.phi, run.scene, seed)
-        return self.freedom.started(problem.join(**start._replace(phi=phi)._asdict()))
+        return self.freedom.started(problem.join(**{**start._asdict(), "phi": phi}))
 
     def _step(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """The design to evaluate after x."""
