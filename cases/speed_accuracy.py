@@ -272,8 +272,8 @@ PAPER = (128, ROBOTS["walker"][0].courant, PLAIN)
 RECOMMENDED = (128, 0.6, PLAIN)
 # On walls the reference is at the Courant number of the recommended setting.
 REFERENCE, QUICK_REFERENCE = (384, 0.6, PLAIN), (128, 0.6, PLAIN)
-# On ground it is extrapolated from two, at a Courant number that viscosity bears on the finest:
-# above it MLS-MPM's forward run still looks sound, but its gradient grows without limit.
+# On ground it is extrapolated from two, at a Courant number that viscosity bears on the finest in
+# both formulations.
 LIMITS, QUICK_LIMITS, LIMIT_COURANT = (128, 256, 384), (32, 64, 128), 0.2
 ORDER = 2  # of both formulations on ground, in cells and step together
 
