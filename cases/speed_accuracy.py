@@ -8,7 +8,8 @@ resolution sees the same robot. On walls they are compared with the finest that 
 ground with a layer there are two formulations: distances are compared with the mean of what both
 tend to, extrapolated from their two finest, and gradients with the mean of the finest. Writes
 ``speed_accuracy.csv``, ``.h5`` and ``.png``, and the tables of the documentation, two of which have
-the time at equal accuracy. What ``speed_accuracy_points.h5`` holds already is not measured again.
+the time at equal accuracy. What ``speed_accuracy_points.h5`` holds already of the
+same sources is not measured again.
 `--peers` adds Taichi in both precisions and Warp at the paper's setting, and what the fastest of
 them would take at equal accuracy. The workers of a cluster must be alike, and each have a processor
 of its own: what counts is their processor time.
@@ -17,6 +18,7 @@ of its own: what counts is their processor time.
 import argparse
 import csv
 import datetime
+import hashlib
 import importlib
 import importlib.metadata
 import itertools
@@ -28,6 +30,7 @@ import sys
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -41,12 +44,13 @@ from exact import Bar, manufactured_error
 from matplotlib.artist import Artist
 from matplotlib.patches import Rectangle
 
+import mpmopt
 from mpmopt.app.sweeps import connected, results, sweep
 from mpmopt.assess.discretisation import Discretisation, Measured, density, measure, sums, timed
 from mpmopt.design.actuation import signal_adjoint
 from mpmopt.design.objective import Objective
 from mpmopt.design.problem import Problem
-from mpmopt.errors import MpmoptError, SceneError
+from mpmopt.errors import MpmoptError, SceneError, SweepError
 from mpmopt.scene import Design, Grid, Material, Scene
 from mpmopt.scene.particles import discretise
 from mpmopt.scene.scene import Formulation
@@ -333,14 +337,26 @@ def measure_robot(name: str, scene: Scene, n: int, courant: float, choice: Choic
     return replace(measured, gradient=in_patches(laid.scene(scene), measured.gradient))
 
 
+@cache
+def sources() -> str:
+    """A digest of what numbers depend on: the package's files and those of the cases."""
+    digest = hashlib.sha256()
+    for folder in (Path(mpmopt.__file__).parent, Path(__file__).parent):
+        for path in sorted(folder.rglob("*.py")):
+            digest.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")
+    return digest.hexdigest()[:20]
+
+
 def measure_point(
-    name: str, scene: str, n: int, courant: float, choice: dict[str, Any]
+    name: str, scene: str, n: int, courant: float, choice: dict[str, Any], program: str
 ) -> dict[str, Any]:
     """The bar, or a robot of a scene, in one discretisation; the fewer seconds of two count.
 
     The first evaluation takes its memory from the system, which can cost as much again; an
-    optimiser pays that once.
+    optimiser pays that once. A worker whose `sources` are not those of the program refuses.
     """
+    if sources() != program:
+        raise SweepError("this worker has other sources than the program that asks it")
     measured = (
         measure_bar(n, courant, Choice(**choice))
         if name == "bar"
@@ -378,7 +394,7 @@ class Bench:
             scenes = [bar if name == "bar" else ROBOTS[name][0] for name, *_ in points]
         wanted = [
             {"name": name, "scene": scene.to_json(), "n": n, "courant": courant,
-             "choice": asdict(choice)}
+             "choice": asdict(choice), "program": sources()}
             for (name, n, courant, choice), scene in zip(points, scenes, strict=True)
         ]  # fmt: skip
         outcomes = sweep(measure_point, wanted, self.store, self.executor, workers=1)

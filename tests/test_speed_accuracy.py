@@ -2,6 +2,7 @@
 
 import csv
 import math
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import h5py
@@ -15,6 +16,7 @@ from speed_accuracy import (
     PLAIN,
     ROBOTS,
     TOTAL,
+    Bench,
     Point,
     at_equal_accuracy,
     design,
@@ -26,7 +28,7 @@ from speed_accuracy import (
 
 from mpmopt.assess.discretisation import Discretisation, Measured, density
 from mpmopt.design.problem import Problem
-from mpmopt.errors import SceneError
+from mpmopt.errors import SceneError, SweepError
 from mpmopt.scene.particles import discretise
 
 BARS = (("bar", "updated"), ("bar", "total"))
@@ -130,6 +132,47 @@ def test_the_time_at_equal_accuracy_is_of_points_that_are_not_right_by_chance():
     assert rows["0.5 %"]["updated"] == "none"
     assert rows["1 %"]["known to"] == "0.30%"
     assert [*rows][-1] == "0.5 %"  # what the reference itself does not know is left out
+
+
+def test_points_of_other_sources_are_measured_again(tmp_path, monkeypatch):
+    measured = []
+
+    def measure_point(name, scene, n, courant, choice, program):
+        measured.append(program)
+        numbers = {"steps": 1, "seconds": 1.0, "megabytes": 1.0, "distance": float(len(measured))}
+        return {**numbers, "gradient": np.ones(1), "failure": ""}
+
+    monkeypatch.setattr(speed_accuracy, "measure_point", measure_point)
+    with ThreadPoolExecutor(1) as threads:
+        bench = Bench(tmp_path / "points.h5", threads)
+        points = [("walker", 64, 0.4, PLAIN)]
+        assert [bench.run(points)[0].measured.distance for _ in range(2)] == [1.0, 1.0]
+        own = speed_accuracy.sources()
+        monkeypatch.setattr(speed_accuracy, "sources", lambda: "others")
+        assert bench.run(points)[0].measured.distance == 2.0
+    assert measured == [own, "others"]
+
+
+def test_sources_are_the_package_and_the_cases(tmp_path, monkeypatch):
+    package, cases = tmp_path / "mpmopt", tmp_path / "cases"
+    files = [package / "__init__.py", package / "kernels" / "step.py", cases / "speed_accuracy.py"]
+    for path in files:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("1\n")
+    monkeypatch.setattr(speed_accuracy.mpmopt, "__file__", str(files[0]))
+    monkeypatch.setattr(speed_accuracy, "__file__", str(files[2]))
+    digest = speed_accuracy.sources.__wrapped__
+    found = [digest()]
+    for path in files:
+        path.write_text("2\n")
+        found.append(digest())
+    assert len(set(found)) == len(files) + 1
+    assert digest() == found[-1]
+
+
+def test_a_worker_with_other_sources_refuses():
+    with pytest.raises(SweepError, match="other sources"):
+        speed_accuracy.measure_point("bar", "", 8, 0.4, {}, "others")
 
 
 def test_peers_take_as_long_as_the_particles_and_steps_that_mls_mpm_needs():
