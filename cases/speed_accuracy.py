@@ -8,8 +8,9 @@ resolution sees the same robot. On walls they are compared with the finest that 
 ground with a layer there are two formulations: distances are compared with the mean of what both
 tend to, extrapolated from their two finest, and gradients with the mean of the finest. Writes
 ``speed_accuracy.csv``, ``.h5`` and ``.png``, and the tables of the documentation, two of which have
-the time at equal accuracy. What ``speed_accuracy_points.h5`` holds already of the
-same sources is not measured again.
+the time at equal accuracy: there, and on fronts, a point counts with the largest error of all
+shorter steps on its cells, as accuracy that is lost when the step is refined was luck (`sound`).
+What ``speed_accuracy_points.h5`` holds already of the same sources is not measured again.
 `--peers` adds Taichi in both precisions and Warp at the paper's setting, and what the fastest of
 them would take at equal accuracy. The workers of a cluster must be alike, and each have a processor
 of its own: what counts is their processor time.
@@ -264,6 +265,7 @@ def settings(quick: bool) -> list[tuple[int, float, Choice]]:
     ]
     others = (MORE_PARTICLES, SINGLE)
     points += [(n, 0.4, choice) for n in smallest if 32 < n < 256 for choice in others]
+    points += [(n, LEAST, MORE_PARTICLES) for n in smallest if 32 < n < 256]
     if not quick:
         points.append(PAPER)
         points += [(n, 0.8, SINGLE) for n in (64, 128, 256)]
@@ -272,6 +274,7 @@ def settings(quick: bool) -> list[tuple[int, float, Choice]]:
 
 
 COURANTS = (0.05, 0.1, 0.2, 0.3, 0.4, 0.6, 0.8)
+LEAST = 0.2  # that all cells are measured with: down to it a step is refined (`sound`)
 PAPER = (128, ROBOTS["walker"][0].courant, PLAIN)
 RECOMMENDED = (128, 0.6, PLAIN)
 # On walls the reference is at the Courant number of the recommended setting.
@@ -414,13 +417,48 @@ class Bench:
         ]
 
 
+def sound(points: Sequence[Point]) -> list[Point]:
+    """The points as they count: each error the largest of all shorter steps on the same cells.
+
+    Of the same scene, formulation, particles a cell and precision; for single precision double
+    speaks too. Accuracy that is lost when the step is refined was luck: errors of cells and step
+    cancel, and nobody knows beforehand at which step. The step is refined to `LEAST`, so that all
+    cells are judged alike; points with shorter ones, which none speaks for, are left out.
+    """
+    shared = [p for p in points if p.courant >= LEAST]
+
+    def worst(point: Point, error: str) -> float:
+        like = {point.choice, PLAIN.name if point.choice == SINGLE.name else point.choice}
+        errors = [
+            getattr(p, error)
+            for p in shared
+            if (p.scene, p.n) == (point.scene, point.n)
+            and p.choice in like
+            and p.steps > point.steps
+        ]
+        own: float = getattr(point, error)
+        # A shorter step that fails has lost all.
+        return own if math.isnan(own) else max([own, *(math.inf if e != e else e for e in errors)])
+
+    return [
+        replace(
+            point,
+            distance_error=worst(point, "distance_error"),
+            gradient_error=worst(point, "gradient_error"),
+            angle=worst(point, "angle"),
+        )
+        for point in shared
+    ]
+
+
 def front(points: Sequence[Point], error: str) -> list[Point]:
-    """The points that nothing is both faster and more accurate than, by seconds."""
+    """The points that nothing is both faster and more accurate than, by seconds, as they count."""
     best: list[Point] = []
-    usable = [p for p in points if math.isfinite(getattr(p, error)) and p.measured.seconds > 0.0]
+    usable = [
+        p for p in sound(points) if math.isfinite(getattr(p, error)) and p.measured.seconds > 0.0
+    ]
     for point in sorted(usable, key=lambda p: (p.measured.seconds, getattr(p, error))):
-        # Peers agree to rounding, which is no gain.
-        if not best or getattr(point, error) < (1.0 - 1e-6) * getattr(best[-1], error):
+        if not best or getattr(point, error) < getattr(best[-1], error):
             best.append(point)
     return best
 
@@ -601,13 +639,13 @@ class Cost:
 def cost(points: Sequence[Point], level: float, error: str = "distance_error") -> Cost | None:
     """The least that some points take to be off by at most so much, and not by chance.
 
-    All with finer cells must be so too, as in `discretisation.cheapest`, up to the finest of all: a
-    step that these do not bear shows by nothing that it is right. Between two numbers of cells
-    errors and costs are taken as powers of the cells, so that none is favoured by the cells that
-    were chosen.
+    With all shorter steps (`sound`), and with all finer cells, as in `discretisation.cheapest`, up
+    to the finest of all: a step that these do not bear shows by nothing that it is right. Between
+    two numbers of cells errors and costs are taken as powers of the cells, so that none is favoured
+    by the cells that were chosen.
     """
     lines: dict[tuple[float, str], list[Point]] = {}
-    for point in sorted(points, key=lambda p: p.n):
+    for point in sorted(sound(points), key=lambda p: p.n):
         if point.choice not in PEERS and point.measured.seconds > 0.0:
             lines.setdefault((point.courant, point.choice), []).append(point)
     found = []
@@ -619,8 +657,8 @@ def cost(points: Sequence[Point], level: float, error: str = "distance_error") -
             first -= 1
         if first == len(line):
             continue
-        if first == 0:
-            found.append(Cost(None, line[0]))
+        if first == 0 or math.isinf(errors[first - 1]):
+            found.append(Cost(None, line[first]))
         else:
             above, below = errors[first - 1], max(errors[first], 1e-12)
             share = math.log(above / level) / math.log(above / below)
@@ -788,7 +826,7 @@ def draw(path: Path, points: Sequence[Point], known: dict[str, tuple[float, floa
     markers.update({name: marker for name, (_, _, marker) in PEERS.items()})
     figure, axes = plt.subplots(3, len(TITLES), figsize=(4.9 * len(TITLES), 14.5))
     for column, (name, title) in enumerate(TITLES.items()):
-        mine = [p for p in points if p.scene == name and not p.measured.failure]
+        mine = [p for p in points if p.scene == name]
         for row, (error, what) in enumerate(
             (
                 ("distance_error", "error of the distance"),

@@ -12,9 +12,11 @@ import speed_accuracy
 from exact import Bar
 from speed_accuracy import (
     BETA,
+    MORE_PARTICLES,
     PATCH,
     PLAIN,
     ROBOTS,
+    SINGLE,
     TOTAL,
     Bench,
     Point,
@@ -24,6 +26,7 @@ from speed_accuracy import (
     in_patches,
     robots,
     settings,
+    sound,
 )
 
 from mpmopt.assess.discretisation import Discretisation, Measured, density
@@ -132,6 +135,71 @@ def test_the_time_at_equal_accuracy_is_of_points_that_are_not_right_by_chance():
     assert rows["0.5 %"]["updated"] == "none"
     assert rows["1 %"]["known to"] == "0.30%"
     assert [*rows][-1] == "0.5 %"  # what the reference itself does not know is left out
+
+
+def swept(n, choice=PLAIN, seconds=0.4, **errors):
+    """Points of the bar by Courant number, with errors of the distance that are ten times those of
+    the gradient; a halved step takes twice the time."""
+    points = []
+    for name, error in errors.items():
+        courant = float(name.replace("c", "0."))
+        here = Discretisation((n, n), 1, formulation=choice.formulation)
+        measured = Measured(here, seconds / courant, distance=1.0)
+        points.append(
+            Point("bar", n, round(1200 / courant), courant, choice.name, measured,
+                  distance_error=error, gradient_error=0.1 * error)
+        )  # fmt: skip
+    return points
+
+
+def counts(points, choice, error="distance_error", n=64):
+    mine = [p for p in sound(points) if (p.n, p.choice) == (n, choice.name)]
+    return {p.courant: getattr(p, error) for p in mine}
+
+
+def test_what_is_lost_when_the_step_is_refined_does_not_count():
+    points = [
+        *swept(64, c05=0.5, c2=0.07, c4=0.01, c6=0.0, c8=0.2),
+        *swept(64, TOTAL, c2=0.03, c3=0.04, c4=0.02),
+        *swept(64, SINGLE, c4=0.02, c8=0.1),
+        *swept(64, MORE_PARTICLES, c4=0.001),
+        *swept(128, c4=0.002),
+    ]
+    # What 0.05 loses counts against no point: finer cells were not measured with it.
+    wanted = {0.2: 0.07, 0.4: 0.07, 0.6: 0.07, 0.8: 0.2}
+    assert counts(points, PLAIN) == wanted
+    gradients = counts(points, PLAIN, "gradient_error")
+    assert gradients == pytest.approx({c: 0.1 * e for c, e in wanted.items()})
+    assert counts(points, TOTAL) == {0.2: 0.03, 0.3: 0.04, 0.4: 0.04}
+    assert counts(points, SINGLE) == {0.4: 0.07, 0.8: 0.1}  # double precision speaks for it too
+    assert counts(points, MORE_PARTICLES) == {0.4: 0.001}  # other cells and particles do not
+    assert counts(points, PLAIN, n=128) == {0.4: 0.002}
+    # A shorter step that fails has lost all.
+    failed = replace(points[1], distance_error=math.nan)
+    lost = counts([failed, *points[2:]], PLAIN)
+    assert math.isnan(lost.pop(0.2))
+    assert lost == dict.fromkeys((0.4, 0.6, 0.8), math.inf)
+
+
+@pytest.mark.parametrize("choice", [PLAIN, TOTAL])
+@pytest.mark.parametrize("error", ["distance_error", "gradient_error"])
+def test_neither_a_front_nor_the_time_at_equal_accuracy_has_luck(choice, error):
+    lucky = [*swept(64, choice, c2=0.1, c6=0.0), *swept(128, choice, 1.6, c2=0.02, c6=0.02)]
+    scale = 1.0 if error == "distance_error" else 0.1
+    best = front(lucky, error)
+    assert [(p.n, p.courant) for p in best] == [(64, 0.6), (128, 0.6)]
+    assert [getattr(p, error) for p in best] == pytest.approx([0.1 * scale, 0.02 * scale])
+    asked = speed_accuracy.cost(lucky, 0.05 * scale, error)
+    assert asked is not None and asked.coarse is not None
+    assert (asked.coarse.n, asked.fine.n) == (64, 128)
+    share = math.log(2.0) / math.log(5.0)
+    assert asked.seconds == pytest.approx(0.4 / 0.6 * 4.0**share)
+    # Between cells whose step fails when it is refined, and finer ones, nothing is known.
+    failed = replace(lucky[0], measured=replace(lucky[0].measured, seconds=math.nan))
+    failed = replace(failed, distance_error=math.nan, gradient_error=math.nan)
+    asked = speed_accuracy.cost([failed, *lucky[1:]], 0.05 * scale, error)
+    assert asked is not None
+    assert (asked.coarse, asked.fine.n, asked.fine.courant) == (None, 128, 0.6)
 
 
 def test_points_of_other_sources_are_measured_again(tmp_path, monkeypatch):
@@ -247,6 +315,10 @@ def test_all_points_can_be_laid_out_and_are_measured_once(quick):
                 continue
             assert here.scene(scene).courant <= courant * (1.0 + 1e-9), name
             assert here.formulation == choice.formulation
+    for n in {n for n, *_ in points}:  # all cells are judged by the same steps
+        for choice in (PLAIN, TOTAL):
+            assert (n, speed_accuracy.LEAST, choice) in points
+    assert (64, speed_accuracy.LEAST, MORE_PARTICLES) in points
     if not quick:
         assert speed_accuracy.PAPER in points
         assert speed_accuracy.RECOMMENDED in points
