@@ -1,6 +1,7 @@
 """Tasks in several scenes: values, gradients, constraints, and that threads change nothing."""
 
 import dataclasses
+import threading
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ from conftest import worst
 
 from mpmopt.assess.threshold import distance, kept
 from mpmopt.assess.verify import complex_step_test
+from mpmopt.design.ensemble import meanwhile
 from mpmopt.design.problem import Problem
 from mpmopt.design.projection import project, project_adjoint
 from mpmopt.design.task import AtMost, Task
@@ -18,6 +20,7 @@ from mpmopt.optimisation.loop import begin, go_on, optimise
 from mpmopt.optimisation.settings import Settings, Stage
 from mpmopt.results.runfile import read_run, write
 from mpmopt.scene import Actuator, Design, Grid, Ground, Material, Scene, Solid
+from mpmopt.simulation.threads import processors
 
 C = 1 / 16
 SCENE = Scene(
@@ -132,6 +135,32 @@ def test_scenes_side_by_side_give_the_same_bits(x, monkeypatch):
     monkeypatch.setattr("os.sched_getaffinity", lambda _: {0}, raising=False)
     alone = problem.evaluate(x)
     assert (both.value, both.gradients.tolist()) == (alone.value, alone.gradients.tolist())
+
+
+def test_what_runs_meanwhile_is_there_when_it_is_asked_for(monkeypatch):
+    begun = threading.Event()
+
+    def fail():
+        raise OSError("made to fail")
+
+    def other():
+        begun.set()
+        return 2
+
+    if processors() > 1:  # the first waits for the other, which has begun
+        assert meanwhile(lambda: begun.wait(60.0), other)[0]
+    monkeypatch.setattr("mpmopt.design.ensemble.processors", lambda: 1)
+    begun.clear()
+    first, given = meanwhile(begun.is_set, other)
+    assert (first, given()) == (False, 2)
+    for count in (1, 2):
+        monkeypatch.setattr("mpmopt.design.ensemble.processors", lambda count=count: count)
+        first, given = meanwhile(lambda: 1, fail)
+        assert first == 1
+        with pytest.raises(OSError, match="made to fail"):
+            given()
+        with pytest.raises(OSError, match="made to fail"):
+            meanwhile(fail, other)
 
 
 def test_bodies_without_grey_count_with_all_scenes(x):

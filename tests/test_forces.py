@@ -1,6 +1,7 @@
 """The books of motions: they close, and their entries are what is known of simple motions."""
 
 import csv
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -12,7 +13,7 @@ from walker import slanted_legs, walker
 
 from mpmopt import kernels
 from mpmopt.__main__ import main
-from mpmopt.assess.forces import ENERGIES, WORKS, books
+from mpmopt.assess.forces import ENERGIES, WORKS, books, cost_of_transport
 from mpmopt.assess.trajectory import Body, Motion, equal_steps
 from mpmopt.design.problem import Problem
 from mpmopt.design.terms import Displacement
@@ -107,6 +108,14 @@ def test_the_books_of_a_walker_close_with_the_square_of_the_step():
     assert coarse.actuation > coarse.work["actuation"].max() > coarse.work["actuation"][-1] > 0.0
     cost = coarse.actuation / (coarse.weight * abs(coarse.travel))
     assert coarse.cost_of_transport == pytest.approx(cost)
+
+
+@pytest.mark.parametrize("formulation", ["total", "updated"])
+def test_a_cost_of_transport_needs_no_books(formulation):
+    walls = {"walls": (), "ground": (Ground.floor(3 / 64),)}
+    simulation = legs(time_step=8e-4, formulation=formulation, **walls)
+    assert cost_of_transport(simulation) == books(simulation).cost_of_transport > 0.0
+    assert math.isinf(cost_of_transport(block(gravity=(0.0, 0.0))))
 
 
 def test_the_books_of_a_total_lagrangian_body_close():

@@ -3,7 +3,6 @@
 import dataclasses
 import re
 from math import inf
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -70,7 +69,7 @@ def told(monkeypatch):
 
     monkeypatch.setattr(summary, "best_actuated", best_actuated)
     monkeypatch.setattr(summary, "study", lambda problem, x: rows)
-    monkeypatch.setattr(summary, "books", lambda simulation: SimpleNamespace(cost_of_transport=1.5))
+    monkeypatch.setattr(summary, "cost_of_transport", lambda simulation: 1.5)
     monkeypatch.setattr(summary, "post_processed", lambda problem, x: 0.45)
     monkeypatch.setattr(summary, "unactuated", lambda problem, x: 0.05)
 
@@ -131,13 +130,13 @@ def test_a_body_without_void_is_simulated_again_only_where_its_reference_failed(
 def test_a_cost_of_transport_is_that_of_the_body_without_grey(told, monkeypatch):
     told((0.1,) * 4, (0.5,) * 4)
     assert summarise(finished())["cost_of_transport"] == 1.5
-    monkeypatch.setattr(summary, "books", lambda simulation: SimpleNamespace(cost_of_transport=inf))
+    monkeypatch.setattr(summary, "cost_of_transport", lambda simulation: inf)
     assert summarise(finished())["cost_of_transport"] is None
 
     def count(simulation):
-        return SimpleNamespace(cost_of_transport=len(simulation.particles.position))
+        return len(simulation.particles.position)
 
-    monkeypatch.setattr(summary, "books", count)
+    monkeypatch.setattr(summary, "cost_of_transport", count)
     low = np.where(np.arange(32) < 8, 1.0, -1.0)
     best = candidate(low, 0.75).x
     there = len(PROBLEM.particles.position) - 32 + threshold.kept(PROBLEM, best).sum()

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpmopt.assess import robustness, threshold
-from mpmopt.assess.forces import books
-from mpmopt.assess.refinement import study
+from mpmopt.assess.forces import cost_of_transport
+from mpmopt.assess.refinement import Variant, study
 from mpmopt.assess.threshold import (
     best_actuated,
     pieces,
@@ -23,6 +23,7 @@ from mpmopt.assess.trajectory import post_processed as without_grey
 from mpmopt.assess.verdict import verdict
 from mpmopt.assess.width import thinnest_member
 from mpmopt.design.actuation import frequencies
+from mpmopt.design.ensemble import side_by_side
 from mpmopt.design.problem import Problem
 from mpmopt.design.variables import Variables
 from mpmopt.errors import MissingLibraryError, SimulationError
@@ -47,14 +48,32 @@ def summarise(
     """
     instance("summarise", "result", result, Optimisation)
     best, problem = result.result, result.problem()
-    designed, *others = rows = study(problem, best.x)
     first = result.first
     assert first is not None
     actuations = [Variables.of(item.x, problem.scene) for item in (first, best)]
     actuation = actuations[1]
-    reference = _value_or_none(
-        lambda: best_actuated(problem.scene, solid_reference, *actuations, task=result.task)
+
+    def best_of(design: threshold.Baseline) -> float:
+        return best_actuated(problem.scene, design, *actuations, task=result.task)
+
+    def by_hand(_: NDArray[np.float64]) -> NDArray[np.bool_]:
+        assert baseline is not None
+        return baseline
+
+    # What takes the interpreter for itself runs while others are in compiled loops.
+    rows: list[Variant]
+    rows, reference, drawn, off, cost, width = side_by_side(
+        lambda ask: ask(),
+        (
+            lambda: study(problem, best.x),
+            lambda: _value_or_none(lambda: best_of(solid_reference)),
+            lambda: None if baseline is None else _value_or_none(lambda: best_of(by_hand)),
+            lambda: _value_or_none(lambda: unactuated(problem, best.x)),
+            lambda: _cost(problem, best.x),
+            lambda: _thinnest_member(problem, best.x),
+        ),
     )
+    designed, *others = rows
     block = np.nan if reference is None else reference
 
     def numbers(values: np.ndarray) -> float | list[float]:
@@ -63,22 +82,14 @@ def summarise(
     found = {
         "start": _value_or_none(lambda: first.objective),
         "reference": reference,
-        "baseline": None
-        if baseline is None
-        else _value_or_none(
-            lambda: best_actuated(problem.scene, lambda _: baseline, *actuations, task=result.task)
-        ),
+        "baseline": drawn,
         "optimised": best.objective,
         # The row has none where the reference failed.
         "post_processed": _value_or_none(lambda: post_processed(problem, best.x))
         if designed.failure
         else _number_or_none(designed.distance),
-        "actuation_off": _value_or_none(lambda: unactuated(problem, best.x)),
-        "cost_of_transport": None
-        if not any(problem.scene.gravity)
-        else _value_or_none(
-            lambda: books(without_grey(problem, best.x).simulation).cost_of_transport
-        ),
+        "actuation_off": off,
+        "cost_of_transport": cost,
         "disconnected_particles": int(
             (pieces(problem.scene, threshold.kept(problem, best.x)) > 0).sum()
         ),
@@ -95,7 +106,7 @@ def summarise(
         "retained_gain": {row.name: _number_or_none(row.retained) for row in others},
         "shorter_steps": {row.name: row.time_step for row in others if row.halved},
         **robustness.study(problem, best.x, full),
-        "thinnest_member": _thinnest_member(problem, best.x),
+        "thinnest_member": width,
         **_constraints(result),
         "non_discreteness": best.non_discreteness,
         "a": numbers(actuation.a),
@@ -114,6 +125,13 @@ def summarise(
 def verdict_of(summary: Mapping[str, Any], result: Optimisation) -> str:
     """The `verdict` on an optimisation, of which there is a summary."""
     return verdict(summary, result.missed, result.task.travels(result.scene))
+
+
+def _cost(problem: Problem, x: NDArray[np.float64]) -> float | None:
+    """The cost of transport without grey; None where nothing has a weight."""
+    if not any(problem.scene.gravity):
+        return None
+    return _value_or_none(lambda: cost_of_transport(without_grey(problem, x).simulation))
 
 
 def _thinnest_member(problem: Problem, x: NDArray[np.float64]) -> float | None:

@@ -86,8 +86,7 @@ class Books:
     @property
     def cost_of_transport(self) -> float:
         """Actuators' work over weight and travel's size; infinite if there is no such product."""
-        carried = self.weight * abs(self.travel)
-        return self.actuation / carried if carried > 0.0 else math.inf
+        return _cost(self.actuation, self.weight, self.travel)
 
     def means(self, count: int = 200) -> tuple[Array, Array, Array]:
         """Forces and places over so many equal parts of the time, as steps alone are rough.
@@ -167,11 +166,7 @@ def books(simulation: Simulation, progress: Callable[[], None] | None = None) ->
     SimulationError
         As `Simulation.run` does.
     """
-    account = (
-        _LatticeAccount(simulation)
-        if isinstance(simulation, LagrangianSimulation)
-        else _Account(simulation)
-    )
+    account = _account(simulation)
     steps, scene = simulation.steps, simulation.scene
     supports = tuple(f"ground {k}" for k in range(len(scene.layers)))
     supports += ("walls",) * bool(scene.walls)
@@ -201,10 +196,39 @@ def books(simulation: Simulation, progress: Callable[[], None] | None = None) ->
         supports=supports,
         force=force,
         place=place,
-        weight=float(account.mass.sum()) * math.hypot(*scene.gravity),
+        weight=account.weight,
         travel=float(moved @ scene.direction),
         actuation=given,
     )
+
+
+def cost_of_transport(simulation: Simulation) -> float:
+    """That of a body's `books`, at a fifth of the time: of the steps only actuators are looked at.
+
+    Raises
+    ------
+    SimulationError
+        As `Simulation.run` does.
+    """
+    account = _account(simulation)
+    states = account.states()
+    first = last = next(states)
+    held, given = account.held(first), 0.0
+    for signal, last in zip(simulation.signal.real, states):
+        before, held = held, account.held(last)
+        given += float(np.maximum(-signal * (held - before), 0.0).sum())
+    moved = account.centre(last) - account.centre(first)
+    return _cost(given, account.weight, float(moved @ simulation.scene.direction))
+
+
+def _cost(actuation: float, weight: float, travel: float) -> float:
+    carried = weight * abs(travel)
+    return actuation / carried if carried > 0.0 else math.inf
+
+
+def _account(simulation: Simulation) -> _Account:
+    lattice = isinstance(simulation, LagrangianSimulation)
+    return _LatticeAccount(simulation) if lattice else _Account(simulation)
 
 
 class _Account:
@@ -250,6 +274,11 @@ class _Account:
     def states(self) -> Iterator[Array]:
         """States (12, N) after 0, 1, ... steps."""
         yield from map(self._both, self.simulation.states())
+
+    @property
+    def weight(self) -> float:
+        """Of all particles."""
+        return float(self.mass.sum()) * math.hypot(*self.scene.gravity)
 
     def centre(self, state: Array) -> Array:
         """Of mass (2,)."""

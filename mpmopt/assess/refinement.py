@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from mpmopt.assess import threshold
 from mpmopt.assess.threshold import distance
+from mpmopt.design.ensemble import side_by_side
 from mpmopt.design.problem import Problem
 from mpmopt.design.variation import refined
 from mpmopt.errors import FractureError, OverlapError, SceneError, SimulationError
@@ -95,11 +96,13 @@ def least(problem: Problem, x: NDArray[np.float64]) -> float:
     DesignError, SceneError, SimulationError
         As the simulations do.
     """
-    scene = problem.scene
-    return min(
-        distance(there, mapped(there, problem, x), problem.split(x), problem.task)
-        for there in (scene.vary(time_step=scene.time_step / 2.0), refined(scene, 2))
-    )
+    scene, variables = problem.scene, problem.split(x)
+
+    def simulated(there: Scene) -> float:
+        return distance(there, mapped(there, problem, x), variables, problem.task)
+
+    finer = scene.vary(time_step=scene.time_step / 2.0), refined(scene, 2)
+    return min(side_by_side(simulated, finer))
 
 
 def mapped(scene: Scene, problem: Problem, x: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -182,8 +185,11 @@ def study(
 
     def simulated(there: Scene) -> tuple[float, float]:
         keep = mapped(there, problem, x)
-        reference = distance(there, np.ones_like(keep), variables, problem.task)
-        return reference, distance(there, keep, variables, problem.task)
+        reference, design = side_by_side(
+            lambda body: distance(there, body, variables, problem.task),
+            (np.ones_like(keep), keep),
+        )
+        return reference, design
 
     for name, make in variants(scene).items():
         there = scene

@@ -216,12 +216,16 @@ def best_actuated(
     """
     particles = discretise(scene)
     keep = baseline(particles.position[particles.designed])
-    values, failure = [], None
-    for actuation in actuations:
+
+    def tried(actuation: Variables) -> float | SimulationError:
         try:
-            values.append(distance(scene, keep, actuation, task))
+            return distance(scene, keep, actuation, task)
         except SimulationError as error:
-            failure = error
-    if failure is not None and not values:
-        raise failure
+            return error
+
+    found = side_by_side(tried, actuations)
+    failures = [each for each in found if isinstance(each, SimulationError)]
+    values = [each for each in found if not isinstance(each, SimulationError)]
+    if failures and not values:
+        raise failures[-1]
     return max(values)

@@ -15,6 +15,7 @@ from mpmopt.simulation.threads import processors
 
 Scene = TypeVar("Scene")
 Result = TypeVar("Result")
+Other = TypeVar("Other")
 
 
 def side_by_side(function: Callable[[Scene], Result], scenes: Sequence[Scene]) -> list[Result]:
@@ -32,6 +33,26 @@ def side_by_side(function: Callable[[Scene], Result], scenes: Sequence[Scene]) -
         return [function(scene) for scene in scenes]
     with ThreadPoolExecutor(workers) as pool:
         return list(pool.map(function, scenes))
+
+
+def meanwhile(
+    function: Callable[[], Result], other: Callable[[], Other]
+) -> tuple[Result, Callable[[], Other]]:
+    """What a function gives, and what asks for that of another, which runs at the same time.
+
+    The other is on a thread of its own; or with one processor, only run when it is asked for. So
+    that a Ctrl-C is heard as ever, the first is not.
+
+    Raises
+    ------
+    Exception
+        What the function raises, once the other has ended; what that raises where it is asked for.
+    """
+    if processors() == 1:
+        return function(), other
+    with ThreadPoolExecutor(1) as pool:
+        found = pool.submit(other)
+        return function(), found.result
 
 
 def together(task: Task, evaluations: Sequence[Evaluation]) -> Evaluation:

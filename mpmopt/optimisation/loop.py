@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from mpmopt.assess import refinement
 from mpmopt.assess.threshold import post_processed
 from mpmopt.design.chain import non_discreteness
+from mpmopt.design.ensemble import meanwhile
 from mpmopt.design.problem import Problem
 from mpmopt.design.task import DEFAULT_TASK, Task
 from mpmopt.design.variables import START, Freedom, completed
@@ -351,8 +352,17 @@ class _Ascent:
         problem, halved = self.problem, self.problem.halvings
         indicators = Indicators(*len(Indicators._fields) * (np.nan,))
         time_step = problem.scene.time_step / 2.0**halved
+
+        def without_void(time_step: float) -> float:
+            return self._without_void(post_processed, problem.at(time_step), x)
+
+        def solid_meanwhile() -> float:
+            """In the step that most evaluations have."""
+            return without_void(problem.scene.time_step) if self.stage.solid else np.nan
+
+        gamma = problem.gamma(x)  # once, before two threads ask for it
         try:
-            evaluation = problem.evaluate(x)
+            evaluation, given = meanwhile(lambda: problem.evaluate(x), solid_meanwhile)
             value, constraints = evaluation.value, evaluation.constraints
             scenes = evaluation.scenes
             gradients = evaluation.gradients
@@ -364,7 +374,7 @@ class _Ascent:
             logger.info("evaluation %d failed: %s", len(run.history), error)
         solid = refined = np.nan
         if self.stage.solid and not failure:
-            solid = self._without_void(post_processed, problem.at(time_step), x)
+            solid = without_void(time_step) if halved else given()
             best = run.best.get(run.stage)
             least = (-best.violation, best.counted) if best else (-np.inf, -np.inf)
             hopeful = (-violation, solid) > least
@@ -374,7 +384,6 @@ class _Ascent:
         before = run.last.x if run.last else x
         slope, free = self.freedom.pullback(gradients[0]), self.freedom.reduced(x)
         movable = np.where(slope > 0.0, free < self.freedom.upper, free > self.freedom.lower)
-        gamma = self.problem.gamma(x)
         candidate = Candidate(
             stage=run.stage,
             beta=self.stage.beta,
