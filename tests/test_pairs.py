@@ -143,6 +143,37 @@ def test_what_moves_alike_keeps_its_lists_but_not_those_of_images(rng):
         assert 2 <= seen < 8
 
 
+@pytest.mark.parametrize("mirror", [None, Mirror("x", 8 * C), Mirror("y", 8 * C)])
+def test_no_particle_moves_farther_than_haste_tells(rng, mirror):
+    corners = RAILS if mirror == Mirror("y", 8 * C) else IMAGES
+    scene = body(*corners, **({"mirror": mirror} if mirror else {}))
+    particles = discretise(scene)
+    particles = particles.subset(rng.uniform(size=len(particles.position)) < 0.6)
+    ones = np.ones(len(particles.position))
+    simulation = LagrangianSimulation(scene, particles, ones, ones, np.zeros((scene.steps, 1)))
+    weights, lattice, touch = simulation._weights[0], simulation.lattice, simulation.lattice.touch
+    there = lattice.haste > 0.0
+    assert np.array_equal(there, lattice.mass > 0.0)
+    assert lattice.haste.max() < 1.5 and lattice.haste[there].min() < 0.03
+    # As fast as may be: some particle is as fast as is told, and none is faster.
+    speed = np.divide(1.0, np.sqrt(lattice.haste), out=np.zeros(len(there)), where=there)
+    assert (weights @ speed).max() == pytest.approx(1.0, rel=1e-12)
+    nodes, rigid = simulation.start.copy(), np.ones(2)
+    nodes[:2] += rng.uniform(-1.0, 1.0, (2, len(there))) * speed
+    if mirror is None:
+        nodes[:2] += 50.0
+    else:
+        rigid[mirror.normal] = 0.0
+        nodes[1 - mirror.normal] += 50.0
+    moved = weights @ (nodes[:2] - simulation.start[:2]).T  # (N, 2)
+    apart = np.hypot(*(moved[:, None] - moved).T).max()
+    if mirror is not None:
+        image = moved * (2.0 * rigid - 1.0)
+        apart = max(apart, np.hypot(*(moved[:, None] - image).T).max())
+    told = kernels.plain(pairs.strayed)(nodes, simulation.start[:2], touch)
+    assert 0.5 * apart <= told * (1.0 + 1e-12) < 5.0
+
+
 def collided(simulation, speed):
     closing(simulation, speed)
     steps = simulation.steps
@@ -208,7 +239,7 @@ def test_the_gradient_is_exact_through_self_contact(rng, case):
     free = simulation_of(scene, **inputs)
     closing(free, 4.0)
     free.lattice = free.lattice._replace(
-        touch=free.lattice.touch._replace(nodes=np.zeros(free.nodes), cells=np.empty(0, np.int64))
+        touch=free.lattice.touch._replace(haste=np.zeros(free.nodes), cells=np.empty(0, np.int64))
     )
     assert np.abs(free.run() - simulation.run()).max() > 0.1 * C
 

@@ -82,6 +82,7 @@ class Lattice(NamedTuple):
     active: NDArray[np.bool_]  # (V,) whether a record has actuated particles
     actuation_stress: NDArray[np.float64]  # (K, 3) second Piola-Kirchhoff S: xx, xy, yy
     mass: NDArray  # (M,) of the nodes, lumped
+    haste: NDArray[np.float64]  # (M,) no particle is faster, squared, than most of haste v^2
     held: NDArray[np.int64]  # (H,) nodes that clamps hold
     holder: NDArray[np.int64]  # (H,) which clamp each of them is in
     clamps: NDArray[np.float64]  # (steps, K, 6) as those of `kernels.arrays.Parameters`
@@ -616,13 +617,13 @@ def steps_per_mass(lattice):
 
 @bare_loop_jit
 def hold(old, new, n, lattice):
-    """Give held nodes the velocity of their clamps in step n; the fastest of these, squared."""
+    """Give held nodes the velocity of their clamps in step n; the most of their haste v^2."""
     fastest = 0.0
     for k, clamp in zip(lattice.held, lattice.holder):
         u, v = lattice.clamps[n, clamp, 4], lattice.clamps[n, clamp, 5]
         new[0, k], new[1, k] = old[0, k] + lattice.dt * u, old[1, k] + lattice.dt * v
         new[2, k], new[3, k] = u, v
-        fastest = max(fastest, u * u + v * v)
+        fastest = max(fastest, lattice.haste[k] * (u * u + v * v))
     return fastest
 
 
@@ -635,9 +636,9 @@ def hold_adjoint(state_bar, lattice):
 
 @bare_loop_jit
 def move(old, new, force, per_mass, lattice):
-    """From a state and the forces on its nodes to the next; their fastest speed then, squared.
+    """From a state and the forces on its nodes to the next; the most of their haste v^2 then.
 
-    The speed is infinite, or not a number, if one's velocity is.
+    It is infinite, or not a number, if one's velocity is.
     """
     M, dt = len(lattice.mass), lattice.dt
     fastest = real(0.0 * four(old, 0))
@@ -659,7 +660,7 @@ def move(old, new, force, per_mass, lattice):
         put_four(new, M + i, four(old, M + i) + dt * v)
         speed = real(u) * real(u) + real(v) * real(v)
         sound = sound and within(speed, 0.0, math.inf)
-        fastest = greatest(speed, fastest)
+        fastest = greatest(four(lattice.haste, i) * speed, fastest)
     if not sound:
         return math.inf
     return max(max(fastest[0], fastest[1]), max(fastest[2], fastest[3]))
@@ -817,7 +818,7 @@ def advance_lattice_adjoint(
             touching, room = renewed(touching, old, touch)
         if len(touching.pairs):
             push_apart_adjoint(touching, old, touch, force_bar, state_bar, bar.grip)
-        step = lattice.dt * fastest_of(old)
+        step = lattice.dt * fastest_of(old, lattice)
         moved += step
         room -= step
         forces_adjoint(old, force_bar, lattice, signal[n], rows, state_bar, bar, signal_bar[n])
@@ -826,13 +827,13 @@ def advance_lattice_adjoint(
 
 
 @bare_loop_jit
-def fastest_of(state):
-    """The speed of the fastest node."""
+def fastest_of(state, lattice):
+    """A speed that no particle exceeds."""
     M = state.shape[1]
     fastest = 0.0 * four(state, 0)
     for i in range(0, M, 4):
         u, v = four(state, 2 * M + i), four(state, 3 * M + i)
-        fastest = greatest(u * u + v * v, fastest)
+        fastest = greatest(four(lattice.haste, i) * (u * u + v * v), fastest)
     return math.sqrt(max(max(fastest[0], fastest[1]), max(fastest[2], fastest[3])))
 
 

@@ -21,6 +21,9 @@ from mpmopt.simulation.indicators import Indicators, looked_at
 from mpmopt.simulation.simulation import Gradient, Simulation
 from mpmopt.simulation.surroundings import holders
 
+# A node of which no particle takes more than one over this is light.
+LIGHT = 16.0
+
 
 class LagrangianSimulation(Simulation):
     """One body on its own lattice: for bodies that do not tear, at a fraction of the cost.
@@ -72,6 +75,7 @@ class LagrangianSimulation(Simulation):
         constants = np.array([of_particles(each) for each in self.data.constants])
         alike = bool(np.all(constants == constants[:, :1]))
         mass = (self._weights[0].T @ of_particles(self.data.mass)).astype(dtype)
+        haste = self._haste()
         axis = self._mirror_axis(high)
         grip, self._grip_slope = pairs.grips(
             of_particles(self.data.stiffness), constants[0] + 2.0 * constants[1], dx / per_cell, dx
@@ -104,7 +108,8 @@ class LagrangianSimulation(Simulation):
             active=np.any(actuated, axis=(0, 2)),
             actuation_stress=self.data.actuation_stress,
             mass=self._folded(mass, axis, columns, width),
-            touch=self._touch(cell, place, low, high, grip),
+            haste=haste**2,
+            touch=self._touch(cell, place, low, high, grip, haste),
             held=held,
             holder=holder[held],
             clamps=self.parameters.clamps,
@@ -131,6 +136,7 @@ class LagrangianSimulation(Simulation):
         low: NDArray[np.int64],
         high: NDArray[np.int64],
         grip: NDArray,
+        haste: NDArray[np.float64],
     ) -> pairs.Touch:
         """What of the body may touch the rest of it, from the particles' places and grips (N,)."""
         mirror, dx, per_cell = self.scene.mirror, self.scene.grid.dx, self.scene.particles_per_cell
@@ -172,9 +178,20 @@ class LagrangianSimulation(Simulation):
             cells=cells,
             blocks=blocks,
             block_corner=np.concatenate([block_corner, block_image]),
-            nodes=nodes,
+            haste=haste * nodes,
             alone=np.full((2, self.nodes), pairs.NOWHERE),
         )
+
+    def _haste(self) -> NDArray[np.float64]:
+        """What of a node's speed counts (M,): no particle is faster than the most of all nodes has.
+
+        A node at a corner, of which particles take next to nothing, has next to no mass either, and
+        trembles far faster than any of them.
+        """
+        weights = self._weights[0]
+        counts = np.minimum(LIGHT * weights.max(axis=0).toarray().ravel(), 1.0)
+        inverse = np.divide(1.0, counts, out=np.zeros_like(counts), where=counts > 0.0)
+        return counts * float((weights @ inverse).max())
 
     def _mirror_axis(self, high: NDArray[np.int64]) -> int:
         """Of the plane that bounds the lattice, or -1."""
