@@ -64,7 +64,8 @@ LATTICE = {
 PARTICLES = {
     "scene": "walker(64, 4e-4)",
     "here": "(kernels.advance,)",
-    "there": "(kernels.closest, kernels.indicators, kernels.advance_adjoint)",
+    "there": "(kernels.closest, kernels.grips, kernels.energy, kernels.indicators, "
+    "kernels.advance_adjoint)",
 }
 
 

@@ -143,7 +143,7 @@ def test_what_runs_meanwhile_is_there_when_it_is_asked_for(monkeypatch):
     def fail():
         raise OSError("made to fail")
 
-    def other():
+    def other() -> int:
         begun.set()
         return 2
 
@@ -151,12 +151,12 @@ def test_what_runs_meanwhile_is_there_when_it_is_asked_for(monkeypatch):
         assert meanwhile(lambda: begun.wait(60.0), other)[0]
     monkeypatch.setattr("mpmopt.design.ensemble.processors", lambda: 1)
     begun.clear()
-    first, given = meanwhile(begun.is_set, other)
+    first, given = meanwhile(lambda: begun.is_set(), other)
     assert (first, given()) == (False, 2)
     for count in (1, 2):
         monkeypatch.setattr("mpmopt.design.ensemble.processors", lambda count=count: count)
-        first, given = meanwhile(lambda: 1, fail)
-        assert first == 1
+        number, given = meanwhile(lambda: 1, fail)
+        assert number == 1
         with pytest.raises(OSError, match="made to fail"):
             given()
         with pytest.raises(OSError, match="made to fail"):

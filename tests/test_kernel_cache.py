@@ -11,6 +11,7 @@ import pytest
 from conftest import small_scene
 from numba import config
 
+from mpmopt import kernels
 from mpmopt.design.problem import Problem
 from mpmopt.kernels import compiler
 from mpmopt.simulation import buffers, lagrangian
@@ -140,3 +141,12 @@ def test_a_run_of_no_steps_compiles_nothing(formulation, monkeypatch):
     assert not asked
     segment.advance(0, 1)
     assert len(asked) == 1
+
+
+def test_the_way_back_is_compiled_only_where_it_is_gone():
+    problem = Problem(small_scene(walls=()))
+    simulation = problem.simulation(problem.join(0.0, 0.5, 0.0, 0.0))
+    adjoint = kernels.advance_adjoint
+    for memory in (None, buffers.Memory()):
+        ((_, theirs),) = simulation.segment(1, memory)._loops()
+        assert any(loop is adjoint for loop, _ in theirs) == (memory is not None)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mpmopt.assess import robustness, threshold
 from mpmopt.assess.forces import cost_of_transport
-from mpmopt.assess.refinement import Variant, study
+from mpmopt.assess.refinement import study
 from mpmopt.assess.threshold import (
     best_actuated,
     pieces,
@@ -56,23 +56,16 @@ def summarise(
     def best_of(design: threshold.Baseline) -> float:
         return best_actuated(problem.scene, design, *actuations, task=result.task)
 
-    def by_hand(_: NDArray[np.float64]) -> NDArray[np.bool_]:
-        assert baseline is not None
-        return baseline
-
     # What takes the interpreter for itself runs while others are in compiled loops.
-    rows: list[Variant]
-    rows, reference, drawn, off, cost, width = side_by_side(
-        lambda ask: ask(),
-        (
-            lambda: study(problem, best.x),
-            lambda: _value_or_none(lambda: best_of(solid_reference)),
-            lambda: None if baseline is None else _value_or_none(lambda: best_of(by_hand)),
-            lambda: _value_or_none(lambda: unactuated(problem, best.x)),
-            lambda: _cost(problem, best.x),
-            lambda: _thinnest_member(problem, best.x),
-        ),
+    asked: tuple[Callable[[], Any], ...] = (
+        lambda: study(problem, best.x),
+        lambda: _value_or_none(lambda: best_of(solid_reference)),
+        lambda: None if baseline is None else _value_or_none(lambda: best_of(lambda _: baseline)),
+        lambda: _value_or_none(lambda: unactuated(problem, best.x)),
+        lambda: _cost(problem, best.x),
+        lambda: _thinnest_member(problem, best.x),
     )
+    rows, reference, drawn, off, cost, width = side_by_side(lambda ask: ask(), asked)
     designed, *others = rows
     block = np.nan if reference is None else reference
 

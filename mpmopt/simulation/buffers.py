@@ -47,7 +47,9 @@ class Memory:
 class Segment:
     """What `kernels.advance` leaves of the steps of a segment, and scratch arrays."""
 
-    def __init__(self, simulation: Simulation, length: int, memory: Memory) -> None:
+    def __init__(self, simulation: Simulation, length: int, memory: Memory | None) -> None:
+        self._goes_back = memory is not None  # what is only looked at leaves none to the next
+        memory = memory or Memory()
         self.simulation, self.memory = simulation, memory
         memory.runs += 1
         self.run = memory.runs
@@ -99,7 +101,8 @@ class Segment:
     def advance(self, first: int, last: int) -> None:
         """Advance from step `first`, whose state is in slot 0, to step `last`."""
         if first < last and self.states.dtype == float:
-            compile_in_two("particles", self._loops)
+            name = "particles" if self._goes_back else "particles, only forward"
+            compile_in_two(name, self._loops)
         simulation = self.simulation
         signal = simulation.signal[first:last]
         parameters = simulation.parameters_of_steps(first, last)
@@ -132,23 +135,23 @@ class Segment:
                 raise _failure(simulation, end, first + reached, particle, state)
 
     def _loops(self) -> list[Round]:
-        """The loops of a run and of its way back, in halves that take as long to compile."""
+        """The loops of a run, and of its way back if it goes back, in halves."""
         simulation, states = self.simulation, self.states
         data, parameters, signal = simulation.data, simulation.parameters, simulation.signal
         run = states, self.grids, self.windows, self.logs, 0, 0, data, parameters, signal
         meeting = np.empty(MEETING, np.int64), 0, 1
         bars = states[0], kernels.ParticleDataBar.zeros(len(data.mass), float), signal[None]
         seen = states[0], simulation._reference, simulation._solid, data, parameters
-        return [
-            (
-                [(kernels.advance, (*run, self.scratch, *meeting))],
-                [
-                    (kernels.closest, seen),
-                    (kernels.indicators, (states[0], data, parameters, 0, 0)),
-                    (kernels.advance_adjoint, (*run, self.scratch, *bars, *meeting)),
-                ],
-            )
+        places, held = np.empty(0, np.int64), np.empty((0, 0))
+        looks = [
+            (kernels.closest, seen),
+            (kernels.grips, (states, places, data, parameters, held)),
+            (kernels.energy, (states[0], data, parameters)),
+            (kernels.indicators, (states[0], data, parameters, 0, 0)),
         ]
+        back = [(kernels.advance_adjoint, (*run, self.scratch, *bars, *meeting))]
+        mine = [(kernels.advance, (*run, self.scratch, *meeting))]
+        return [(mine, looks + back if self._goes_back else looks)]
 
     def advance_adjoint(
         self,

@@ -291,7 +291,7 @@ class Simulation:
 
     def segment(self, length: int, memory: Memory | None = None) -> Segment:
         """Room for so many steps, with the initial state in slot 0."""
-        return Segment(self, length, memory or Memory())
+        return Segment(self, length, memory)
 
     @property
     def steps(self) -> int:
