@@ -191,7 +191,7 @@ class LagrangianSimulation(Simulation):
         weights = self._weights[0]
         counts = np.minimum(LIGHT * weights.max(axis=0).toarray().ravel(), 1.0)
         inverse = np.divide(1.0, counts, out=np.zeros_like(counts), where=counts > 0.0)
-        return counts * float((weights @ inverse).max())
+        return counts * max(float((weights @ inverse).max()), 1.0)
 
     def _mirror_axis(self, high: NDArray[np.int64]) -> int:
         """Of the plane that bounds the lattice, or -1."""
