@@ -144,7 +144,7 @@ def test_what_moves_alike_keeps_its_lists_but_not_those_of_images(rng):
 
 
 @pytest.mark.parametrize("mirror", [None, Mirror("x", 8 * C), Mirror("y", 8 * C)])
-def test_no_particle_moves_farther_than_haste_tells(rng, mirror):
+def test_no_particle_moves_farther_than_influence_tells(rng, mirror):
     corners = RAILS if mirror == Mirror("y", 8 * C) else IMAGES
     scene = body(*corners, **({"mirror": mirror} if mirror else {}))
     particles = discretise(scene)
@@ -152,15 +152,17 @@ def test_no_particle_moves_farther_than_haste_tells(rng, mirror):
     ones = np.ones(len(particles.position))
     simulation = LagrangianSimulation(scene, particles, ones, ones, np.zeros((scene.steps, 1)))
     weights, lattice, touch = simulation._weights[0], simulation.lattice, simulation.lattice.touch
-    there = lattice.haste > 0.0
+    there = lattice.squared_influence > 0.0
     assert np.array_equal(there, lattice.mass > 0.0)
-    assert lattice.haste.max() < 1.5 and lattice.haste[there].min() < 0.03
+    assert lattice.squared_influence.max() < 1.5 and lattice.squared_influence[there].min() < 0.03
     # As fast as may be: some particle is as fast as is told, and none is faster.
-    speed = np.divide(1.0, np.sqrt(lattice.haste), out=np.zeros(len(there)), where=there)
+    speed = np.divide(
+        1.0, np.sqrt(lattice.squared_influence), out=np.zeros(len(there)), where=there
+    )
     assert (weights @ speed).max() == pytest.approx(1.0, rel=1e-12)
     other = 0 if mirror is None else 1 - mirror.normal
     turned = np.where(np.arange(2) == other, 1.0, -1.0)  # as an image goes
-    for some in (there, there & (lattice.haste < 1.0)):  # all, and only those at corners
+    for some in (there, there & (lattice.squared_influence < 1.0)):  # the others are at corners
         nodes = simulation.start.copy()
         nodes[:2] += some * rng.uniform(-1.0, 1.0, (2, len(there))) * speed
         nodes[other] += 50.0  # which all share
@@ -236,7 +238,9 @@ def test_the_gradient_is_exact_through_self_contact(rng, case):
     free = simulation_of(scene, **inputs)
     closing(free, 4.0)
     free.lattice = free.lattice._replace(
-        touch=free.lattice.touch._replace(haste=np.zeros(free.nodes), cells=np.empty(0, np.int64))
+        touch=free.lattice.touch._replace(
+            influence=np.zeros(free.nodes), cells=np.empty(0, np.int64)
+        )
     )
     assert np.abs(free.run() - simulation.run()).max() > 0.1 * C
 

@@ -82,7 +82,7 @@ class Lattice(NamedTuple):
     active: NDArray[np.bool_]  # (V,) whether a record has actuated particles
     actuation_stress: NDArray[np.float64]  # (K, 3) second Piola-Kirchhoff S: xx, xy, yy
     mass: NDArray  # (M,) of the nodes, lumped
-    haste: NDArray[np.float64]  # (M,) no particle is faster, squared, than most of haste v^2
+    squared_influence: NDArray[np.float64]  # (M,) no particle has more v^2 than the most of it v^2
     held: NDArray[np.int64]  # (H,) nodes that clamps hold
     holder: NDArray[np.int64]  # (H,) which clamp each of them is in
     clamps: NDArray[np.float64]  # (steps, K, 6) as those of `kernels.arrays.Parameters`
@@ -617,13 +617,13 @@ def steps_per_mass(lattice):
 
 @bare_loop_jit
 def hold(old, new, n, lattice):
-    """Give held nodes the velocity of their clamps in step n; the most of their haste v^2."""
+    """Give held nodes the velocity of their clamps in step n; the most of influence^2 v^2."""
     fastest = 0.0
     for k, clamp in zip(lattice.held, lattice.holder):
         u, v = lattice.clamps[n, clamp, 4], lattice.clamps[n, clamp, 5]
         new[0, k], new[1, k] = old[0, k] + lattice.dt * u, old[1, k] + lattice.dt * v
         new[2, k], new[3, k] = u, v
-        fastest = max(fastest, lattice.haste[k] * (u * u + v * v))
+        fastest = max(fastest, lattice.squared_influence[k] * (u * u + v * v))
     return fastest
 
 
@@ -636,7 +636,7 @@ def hold_adjoint(state_bar, lattice):
 
 @bare_loop_jit
 def move(old, new, force, per_mass, lattice):
-    """From a state and the forces on its nodes to the next; the most of their haste v^2 then.
+    """From a state and the forces on its nodes to the next; the most of influence^2 v^2 then.
 
     It is infinite, or not a number, if one's velocity is.
     """
@@ -660,7 +660,7 @@ def move(old, new, force, per_mass, lattice):
         put_four(new, M + i, four(old, M + i) + dt * v)
         speed = real(u) * real(u) + real(v) * real(v)
         sound = sound and within(speed, 0.0, math.inf)
-        fastest = greatest(four(lattice.haste, i) * speed, fastest)
+        fastest = greatest(four(lattice.squared_influence, i) * speed, fastest)
     if not sound:
         return math.inf
     return max(max(fastest[0], fastest[1]), max(fastest[2], fastest[3]))
@@ -833,7 +833,7 @@ def fastest_of(state, lattice):
     fastest = 0.0 * four(state, 0)
     for i in range(0, M, 4):
         u, v = four(state, 2 * M + i), four(state, 3 * M + i)
-        fastest = greatest(four(lattice.haste, i) * (u * u + v * v), fastest)
+        fastest = greatest(four(lattice.squared_influence, i) * (u * u + v * v), fastest)
     return math.sqrt(max(max(fastest[0], fastest[1]), max(fastest[2], fastest[3])))
 
 

@@ -47,7 +47,7 @@ class Touch(NamedTuple):
     cells: NDArray[np.int64]  # those with a grip above zero
     blocks: NDArray[np.int64]  # (B, 4) these cells, `SIDE` by `SIDE`, or -1
     block_corner: NDArray[np.int64]  # (2 B, 2) place of the first cell of a block, and of its image
-    haste: NDArray[np.float64]  # (M,) root of the lattice's at nodes of these cells, else 0
+    influence: NDArray[np.float64]  # (M,) root of the lattice's at nodes of these cells, else 0
     alone: NDArray[np.float64]  # (2, M) where the nodes were when no cells were near; a cache
 
 
@@ -102,16 +102,17 @@ def flipped(x, y, touch):
 def strayed(nodes, at, touch):
     """By how much at most two of what may touch came nearer than they were, halved.
 
-    No particle is displaced from a place by more than the most of haste times a node's displacement
-    from there. The place is the middle of the box of displacements of nodes that count in full:
-    what all share brings none nearer. Along a mirror plane's normal an image goes the other way.
+    No particle is displaced from a place by more than the most of influence times a node's
+    displacement from there. The place is the middle of the box of displacements of nodes that count
+    in full: what all share brings none nearer. Along a mirror plane's normal an image goes the
+    other way.
     """
     if at[0, 0] == NOWHERE:
         return math.inf
     low_x = low_y = math.inf
     high_x = high_y = -math.inf
     for i in range(at.shape[1]):
-        if touch.haste[i] >= 1.0:
+        if touch.influence[i] >= 1.0:
             dx, dy = nodes[0, i].real - at[0, i], nodes[1, i].real - at[1, i]
             low_x, high_x = min(low_x, dx), max(high_x, dx)
             low_y, high_y = min(low_y, dy), max(high_y, dy)
@@ -122,8 +123,8 @@ def strayed(nodes, at, touch):
     most_x = most_y = 0.0
     for i in range(at.shape[1]):
         dx, dy = nodes[0, i].real - at[0, i] - middle_x, nodes[1, i].real - at[1, i] - middle_y
-        most_x = max(most_x, touch.haste[i] * abs(dx))
-        most_y = max(most_y, touch.haste[i] * abs(dy))
+        most_x = max(most_x, touch.influence[i] * abs(dx))
+        most_y = max(most_y, touch.influence[i] * abs(dy))
     return math.hypot(most_x, most_y)
 
 

@@ -75,7 +75,7 @@ class LagrangianSimulation(Simulation):
         constants = np.array([of_particles(each) for each in self.data.constants])
         alike = bool(np.all(constants == constants[:, :1]))
         mass = (self._weights[0].T @ of_particles(self.data.mass)).astype(dtype)
-        haste = self._haste()
+        influence = self._influence()
         axis = self._mirror_axis(high)
         grip, self._grip_slope = pairs.grips(
             of_particles(self.data.stiffness), constants[0] + 2.0 * constants[1], dx / per_cell, dx
@@ -108,8 +108,8 @@ class LagrangianSimulation(Simulation):
             active=np.any(actuated, axis=(0, 2)),
             actuation_stress=self.data.actuation_stress,
             mass=self._folded(mass, axis, columns, width),
-            haste=haste**2,
-            touch=self._touch(cell, place, low, high, grip, haste),
+            squared_influence=influence**2,
+            touch=self._touch(cell, place, low, high, grip, influence),
             held=held,
             holder=holder[held],
             clamps=self.parameters.clamps,
@@ -136,7 +136,7 @@ class LagrangianSimulation(Simulation):
         low: NDArray[np.int64],
         high: NDArray[np.int64],
         grip: NDArray,
-        haste: NDArray[np.float64],
+        influence: NDArray[np.float64],
     ) -> pairs.Touch:
         """What of the body may touch the rest of it, from the particles' places and grips (N,)."""
         mirror, dx, per_cell = self.scene.mirror, self.scene.grid.dx, self.scene.particles_per_cell
@@ -178,11 +178,11 @@ class LagrangianSimulation(Simulation):
             cells=cells,
             blocks=blocks,
             block_corner=np.concatenate([block_corner, block_image]),
-            haste=haste * nodes,
+            influence=influence * nodes,
             alone=np.full((2, self.nodes), pairs.NOWHERE),
         )
 
-    def _haste(self) -> NDArray[np.float64]:
+    def _influence(self) -> NDArray[np.float64]:
         """What of a node's speed counts (M,): no particle is faster than the most of all nodes has.
 
         A node at a corner, of which particles take next to nothing, has next to no mass either, and
