@@ -27,7 +27,7 @@ def climber(cells: int, time_step: float, seconds: float) -> Scene:
     """
     c = 1 / 64
     left, right, low, high = 24 * c, 40 * c, 18 * c, 42 * c  # of the body
-    # The shaft's layers are a cell thick. They squeeze the body, so that it holds on smooth walls too.
+    # The shaft's layers, a cell thick, squeeze the body, so that it holds on smooth walls too.
     walls, bottom = (23.6 * c, 40.4 * c), 4 * c
     shaft = ((walls[0], 1.0), (walls[0], bottom), (walls[1], bottom), (walls[1], 1.0))
     actuators = tuple(
