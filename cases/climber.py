@@ -20,14 +20,18 @@ from mpmopt.scene import Actuator, Design, Grid, Ground, Material, Mirror, Scene
 
 
 def climber(cells: int, time_step: float, seconds: float) -> Scene:
-    """The climber on `cells` cells across; what comes in the first second does not count."""
+    """The climber on `cells` cells across; what comes in the first second does not count.
+
+    Cores half as wide as the body are strong enough to drag its feet where friction is high, though
+    the shaft presses enough to hold it where friction is low.
+    """
     c = 1 / 64
-    left, right, low, high = 26 * c, 38 * c, 18 * c, 42 * c  # of the body
-    # The shaft's layers are a cell thick and squeeze the body a little, so that it holds at first.
-    walls, bottom = (25.22 * c, 38.78 * c), 4 * c
+    left, right, low, high = 24 * c, 40 * c, 18 * c, 42 * c  # of the body
+    # The shaft's layers, a cell thick, squeeze the body, so that it holds on smooth walls too.
+    walls, bottom = (23.6 * c, 40.4 * c), 4 * c
     shaft = ((walls[0], 1.0), (walls[0], bottom), (walls[1], bottom), (walls[1], 1.0))
     actuators = tuple(
-        Actuator((30 * c, y * c), (34 * c, (y + 6) * c), detuning=0.9) for y in (21, 27, 33)
+        Actuator((28 * c, y * c), (36 * c, (y + 6) * c), detuning=0.9) for y in (21, 27, 33)
     )
     return Scene(
         grid=Grid(cells=(cells, 5 * cells // 2), dx=1 / cells),
@@ -36,14 +40,14 @@ def climber(cells: int, time_step: float, seconds: float) -> Scene:
         transient=1.0,
         gravity=(0.0, -1.0),
         direction=(0.0, 1.0),
-        ground=(Ground(shaft, friction=1.0, thickness=c),),
+        ground=(Ground(shaft, friction=0.5, thickness=c),),
         material=Material(viscosity=0.03),
         formulation="total",
         body=(
             Design((left, low), (right, 21 * c)),
-            Design((left, 21 * c), (30 * c, 39 * c)),
+            Design((left, 21 * c), (28 * c, 39 * c)),
             *actuators,
-            Design((34 * c, 21 * c), (right, 39 * c)),
+            Design((36 * c, 21 * c), (right, 39 * c)),
             Design((left, 39 * c), (right, high)),
         ),
         filter_length=2 * c,
@@ -54,11 +58,12 @@ def climber(cells: int, time_step: float, seconds: float) -> Scene:
 def three_pairs(positions: np.ndarray) -> np.ndarray:
     """A spine, two pairs of legs that lean down, and one further down that leans up.
 
-    The best of 4786 drawings, of which only 15 climb 0.02 a second or more in all scenes.
+    The best of 4786 drawings in a body with narrower cores, widened with it. It merely creeps up,
+    and slips where friction is 0.3; what it climbs is the optimisation's.
     """
     c = 1 / 64
     x, y = positions.T
-    away = abs(x - 32 * c) / (6 * c)
+    away = abs(x - 32 * c) / (8 * c)
     legs = [
         abs(y + slant * c * away - top * c) <= 0.5 * c * (root + (foot - root) * away)
         for top, slant, root, foot in (
@@ -67,7 +72,7 @@ def three_pairs(positions: np.ndarray) -> np.ndarray:
             (21.8, -1.8, 4.3, 1.8),
         )
     ]
-    return np.any([*legs, away <= 2 / 6], axis=0)
+    return np.any([*legs, away <= 4 / 8], axis=0)
 
 
 START = {
@@ -82,9 +87,9 @@ START = {
 TASK = Task(
     subject_to=(IN_ONE_PIECE,),
     scenes=(
-        Variation(friction=0.7, strength=0.9),
-        Variation(friction=0.9),
-        Variation(friction=1.2, strength=1.1),
+        Variation(friction=0.28, strength=0.9),
+        Variation(friction=0.45),
+        Variation(friction=0.72, strength=1.1),
     ),
     variables=(Bounded("b", lower=-0.3, upper=0.3), Tied("omega", to=0)),
     soft_minimum=8.0,

@@ -28,6 +28,7 @@ from mpmopt.design.terms import Volume
 from mpmopt.design.variables import START
 from mpmopt.errors import DesignError, RunFileError, StorageError
 from mpmopt.optimisation.loop import optimise
+from mpmopt.optimisation.presets import gait
 from mpmopt.optimisation.settings import Settings, Stage
 from mpmopt.results import runfile
 from mpmopt.validation import digits
@@ -95,16 +96,18 @@ def test_a_small_crawler_crawls_even_without_its_void(tmp_path):
 
 @pytest.mark.case
 def test_a_small_climber_climbs_even_without_its_void(tmp_path):
-    settings = dataclasses.replace(SMALL.settings, least_iterations=10, most_iterations=10)
-    case = Case(climber.climber(64, 8e-4, 2.0), settings, climber.three_pairs, climber.START)
-    summary = run(case, tmp_path)
-    assert summary["start"] == pytest.approx(30 / 64, abs=0.005)  # it stays where it is put
+    """By its own recipe, which is black and white: grey feet do not press enough to hold it."""
+    scene = climber.climber(64, 1e-3, 2.0)
+    recipe = gait(10, 0.005), climber.three_pairs, climber.START, climber.TASK
+    summary = run(Case(scene, *recipe), tmp_path)
+    assert 0.0 <= summary["start"] - 30 / 64 <= 0.03  # it stays where it is put
+    assert summary["post_processed"] >= summary["start"] + 0.02
     assert summary["optimised"] - summary["reference"] >= 0.02
     assert summary["post_processed"] - summary["reference"] >= 0.015
     assert summary["disconnected_particles"] == 0
     assert summary["failed_evaluations"] == 0
     assert np.shape(summary["theta"]) == (3,)  # each core kept a phase of its own
-    assert np.ptp(summary["theta"]) >= 0.3
+    assert np.ptp(summary["theta"]) >= 0.15
 
 
 def test_the_folder_holds_run_summary_and_pictures(folder):
