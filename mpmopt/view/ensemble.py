@@ -3,12 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-
-import numpy as np
-from numpy.typing import NDArray
 
 from mpmopt.assess.robustness import FEW_FRICTIONS, Robot, lasting, unit
 from mpmopt.assess.trajectory import Motion, equal_steps
@@ -16,10 +12,8 @@ from mpmopt.design.problem import Problem
 from mpmopt.design.step_control import with_halvings
 from mpmopt.design.variation import Variation
 from mpmopt.errors import DesignError, SimulationError
-from mpmopt.io.files import replace_file
-from mpmopt.io.progress import Progress
 from mpmopt.optimisation.history import Optimisation
-from mpmopt.view.film import LAST, RATE, Filmed, Screen, encoded
+from mpmopt.view.film import LAST, Filmed, Screen, count_frames, write
 from mpmopt.view.gait import body_of
 
 logger = logging.getLogger(__name__)
@@ -55,9 +49,7 @@ def film_scenes(path: Path, run: Optimisation, seconds: float = SECONDS) -> Film
         raise DesignError(
             "film: only robots on ground, with actuators, are filmed in several scenes"
         )
-    count = round(seconds * RATE) if 0.0 < seconds <= 600.0 else 0
-    if count < 2:
-        raise DesignError(f"film: seconds = {seconds!r} must be from {2 / RATE:g} to 600")
+    count = count_frames(path, seconds)
     scenes = run.task.scenes or tuple(Variation(friction=value) for value in FEW_FRICTIONS)
     x, shown, motions = run.result.x, SHOWN * unit(problem.scene), []
 
@@ -74,15 +66,6 @@ def film_scenes(path: Path, run: Optimisation, seconds: float = SECONDS) -> Film
             logger.warning("the film is without the scene of %s: %s", variation, error)
     if not motions:
         raise DesignError("film: the robot cannot be simulated in any of its scenes")
-    screen = Screen(motions, seconds / shown)
-    with Progress("frames", count) as progress:
-
-        def frames() -> Iterator[NDArray[np.uint8]]:
-            for number in range(count):
-                yield screen.frame(number)
-                progress.step()
-
-        content = encoded(path, frames())
-    replace_file(path, content)
+    size = write(path, Screen(motions, seconds / shown))
     per_period = count * Robot.of(problem, x).period(problem.scene) / shown
-    return Filmed(count, seconds + LAST, seconds / shown, per_period, len(content))
+    return Filmed(count, seconds + LAST, seconds / shown, per_period, size)
