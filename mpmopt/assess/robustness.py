@@ -19,7 +19,6 @@ from mpmopt.assess import threshold
 from mpmopt.assess.refinement import (
     HALVINGS,
     other_formulation,
-    with_shorter_steps,
     with_twice_the_step,
 )
 from mpmopt.assess.threshold import SOLID_LIMITS, solid_body
@@ -27,7 +26,7 @@ from mpmopt.design.actuation import frequencies
 from mpmopt.design.ensemble import side_by_side
 from mpmopt.design.objective import Objective
 from mpmopt.design.problem import Problem
-from mpmopt.design.step_control import check_indicators
+from mpmopt.design.step_control import check_indicators, with_halvings
 from mpmopt.design.variables import Variables
 from mpmopt.design.variation import Variation
 from mpmopt.errors import SceneError, SimulationError
@@ -514,7 +513,7 @@ def _speeds(
 
         try:
             scene = trial.scene()
-            value, halved = with_shorter_steps(scene, simulated, trial.halvings)
+            value, halved = with_halvings(scene, simulated, trial.halvings)
             speeds[name] = value
             if halved:
                 shorter[name] = scene.time_step / 2**halved

@@ -287,7 +287,11 @@ class Problem:
         """In all scenes of the task, each in a time step that is short enough."""
 
         def accepted(problem: Problem) -> Evaluation:
-            evaluation, halved = with_halvings(problem, lambda p: evaluate(p, x), self.halvings)
+            def in_scene(scene: Scene) -> Evaluation:
+                same = scene is problem.scene
+                return evaluate(problem if same else problem.at(scene.time_step), x)
+
+            evaluation, halved = with_halvings(problem.scene, in_scene, self.halvings)
             return dataclasses.replace(evaluation, halved=halved)
 
         if not self.members:

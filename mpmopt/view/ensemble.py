@@ -8,11 +8,11 @@ from pathlib import Path
 
 from mpmopt.assess.robustness import FEW_FRICTIONS, Robot, lasting, unit
 from mpmopt.assess.trajectory import Motion, equal_steps
-from mpmopt.design.problem import Problem
 from mpmopt.design.step_control import with_halvings
 from mpmopt.design.variation import Variation
 from mpmopt.errors import DesignError, SimulationError
 from mpmopt.optimisation.history import Optimisation
+from mpmopt.scene import Scene
 from mpmopt.view.film import LAST, Filmed, Screen, count_frames, write
 from mpmopt.view.gait import body_of
 
@@ -51,21 +51,20 @@ def film_scenes(path: Path, run: Optimisation, seconds: float = SECONDS) -> Film
         )
     count = count_frames(path, seconds)
     scenes = run.task.scenes or tuple(Variation(friction=value) for value in FEW_FRICTIONS)
-    x, shown, motions = run.result.x, SHOWN * unit(problem.scene), []
+    robot, shown, motions = Robot.of(problem, run.result.x), SHOWN * unit(problem.scene), []
 
-    def motion(variation: Variation, problem: Problem) -> Motion:
-        scene = lasting(variation.scene(problem.scene), shown)
-        body = body_of(Robot.of(problem, x), scene, str(variation))
-        return Motion.of(body, equal_steps(scene, count))
+    def motion(variation: Variation, scene: Scene) -> Motion:
+        scene = lasting(variation.scene(scene), shown)
+        return Motion.of(body_of(robot, scene, str(variation)), equal_steps(scene, count))
 
     for variation in scenes:
         try:
-            seen, _ = with_halvings(problem, partial(motion, variation), problem.halvings)
+            seen, _ = with_halvings(problem.scene, partial(motion, variation), problem.halvings)
             motions.append(seen)
         except SimulationError as error:
             logger.warning("the film is without the scene of %s: %s", variation, error)
     if not motions:
         raise DesignError("film: the robot cannot be simulated in any of its scenes")
     size = write(path, Screen(motions, seconds / shown))
-    per_period = count * Robot.of(problem, x).period(problem.scene) / shown
+    per_period = count * robot.period(problem.scene) / shown
     return Filmed(count, seconds + LAST, seconds / shown, per_period, size)
