@@ -119,9 +119,7 @@ def distance_with_void(
         return distance(scene, keep, variables)
     scene = void.of(scene)
     particles = discretise(scene)
-    gamma = np.ones(particles.designed.size)
-    gamma[particles.designed] = keep
-    material = interpolate(scene.material, gamma)
+    material = interpolate(scene.material, particles.completed(keep.astype(float)))
     driven = signal(scene, variables.a, variables.theta, variables.b)
     simulation = Simulation(scene, particles, *material, driven)
     return float(Objective.of(scene, particles).centroid(simulation.run()))

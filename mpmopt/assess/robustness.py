@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import label
 
 from mpmopt.assess import threshold
 from mpmopt.assess.refinement import (
@@ -345,14 +344,8 @@ def components(scene: Scene, keep: NDArray[np.bool_]) -> int:
         Design particles that are there.
     """
     half, whole = discretise(scene), discretise(scene, whole=True)
-    there = ~half.designed
-    there[half.designed] = keep
-    there = there[mirror_images(scene, half, whole)]
-    index = np.floor(whole.position * scene.particles_per_cell / scene.grid.dx).astype(int)
-    i, j = (index - index.min(axis=0)).T
-    lattice = np.zeros((i.max() + 1, j.max() + 1), dtype=bool)
-    lattice[i, j] = there
-    return int(label(lattice)[1])
+    there = half.completed(keep)[mirror_images(scene, half, whole)]
+    return int(threshold.connected(scene, whole, there).max())
 
 
 def study(

@@ -67,8 +67,8 @@ class Body:
 
 def optimised(problem: Problem, x: NDArray[np.float64]) -> Body:
     """A design as it was optimised, with its void."""
-    gamma, design = np.ones(len(problem.particles.position)), problem.gamma(x)
-    gamma[problem.particles.designed] = design
+    design = problem.gamma(x)
+    gamma = problem.particles.completed(design)
     present = problem.present(problem.split(x).phi)
     simulation, objective = problem.simulation(x), problem.task.maximise
     return Body("optimised design", simulation, gamma[present], objective, design)
