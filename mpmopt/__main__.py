@@ -228,10 +228,9 @@ def forces(path: Path, out: Path | None, force: bool) -> None:
     """Print, write and draw what drives and bears a run's best design, without grey."""
     import numpy as np
 
-    from mpmopt.app.sweeps import as_csv
     from mpmopt.assess.forces import books
     from mpmopt.assess.trajectory import post_processed
-    from mpmopt.io.files import make_folder, refuse_existing, replace_file
+    from mpmopt.io.files import as_csv, make_folder, refuse_existing, replace_file
     from mpmopt.io.progress import Progress
     from mpmopt.validation import digits
     from mpmopt.view.plot import plot_forces, plot_motion
