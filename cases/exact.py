@@ -3,11 +3,12 @@
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mpmopt import kernels
 from mpmopt.design.objective import Objective
 from mpmopt.scene import Grid, Material, Mirror, Scene, Solid
-from mpmopt.scene.particles import discretise, of_solid
+from mpmopt.scene.particles import Particles, discretise, of_solid
 from mpmopt.simulation.checkpoints import Checkpointing
 from mpmopt.simulation.lagrangian import LagrangianSimulation
 from mpmopt.simulation.simulation import Simulation
@@ -27,7 +28,8 @@ def solid_simulation(scene, particles=None, state=None, precision="double"):
     )  # fmt: skip
 
 
-def at_rest(particles):
+def at_rest(particles: Particles) -> NDArray[np.float64]:
+    """State (12, N) of particles that do not move and are not deformed."""
     state = np.zeros((12, len(particles.position)))
     state[0:2] = particles.position.T
     state[[8, 11]] = 1.0

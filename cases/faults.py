@@ -34,14 +34,13 @@ from walker import slanted_legs, walker
 import mpmopt
 from mpmopt.app import case
 from mpmopt.app.summary import table
-from mpmopt.app.sweeps import as_csv
 from mpmopt.assess.threshold import solid_reference
 from mpmopt.design.one_piece import OnePiece
 from mpmopt.design.task import AtMost, Task
 from mpmopt.design.terms import Displacement, Effort, Volume
 from mpmopt.design.variation import Variation
 from mpmopt.io.console import how_to_go_on, reported
-from mpmopt.io.files import replace_file
+from mpmopt.io.files import as_csv, replace_file
 from mpmopt.optimisation.settings import Settings, Stage
 from mpmopt.results import runfile
 from mpmopt.scene import Actuator, Design, Grid, Ground, Material, Scene, Solid

@@ -21,12 +21,11 @@ from numpy.typing import NDArray
 from stability import gradients
 from walker import slanted_legs, walker
 
-from mpmopt.app.sweeps import as_csv
 from mpmopt.assess.threshold import solid_body
 from mpmopt.design.problem import Problem
 from mpmopt.design.variables import START, Variables
 from mpmopt.errors import SimulationError
-from mpmopt.io.files import replace_file
+from mpmopt.io.files import as_csv, replace_file
 from mpmopt.scene import Ground, Scene, Wall
 from mpmopt.scene.particles import discretise
 

@@ -16,13 +16,12 @@ from typing import Any
 
 import walker
 
-from mpmopt.app.sweeps import as_csv
 from mpmopt.assess.robustness import Robot, Trial, speed
 from mpmopt.design.task import Task
 from mpmopt.design.variation import Variation
 from mpmopt.errors import SceneError, SimulationError, StorageError
 from mpmopt.io.console import reported
-from mpmopt.io.files import make_folder, replace_file
+from mpmopt.io.files import as_csv, make_folder, replace_file
 from mpmopt.io.progress import Progress
 from mpmopt.optimisation.history import Optimisation
 from mpmopt.optimisation.loop import begin, go_on

@@ -8,8 +8,6 @@ gains over the reference compare, distances do not.
 """
 
 import argparse
-import csv
-import io
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -20,6 +18,7 @@ import walker
 
 from mpmopt.app import case
 from mpmopt.errors import MpmoptError
+from mpmopt.io.files import as_csv, replace_file
 from mpmopt.results import runfile
 
 CASES = {"walker": walker.CASES, "crawler": crawler.CASES}
@@ -97,12 +96,8 @@ def main(argv: list[str] | None = None) -> int:
             name: summary_of(name, arguments.setting, arguments.out / name) for name in CASES
         }
         lines = rows(summaries, arguments.setting)
-        text = io.StringIO()
-        writer = csv.DictWriter(text, lines[0], lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(lines)
-        runfile.replace_file(arguments.out / "tables.csv", text.getvalue().encode())
-        runfile.replace_file(arguments.out / "tables.md", markdown(lines).encode())
+        replace_file(arguments.out / "tables.csv", as_csv(lines).encode())
+        replace_file(arguments.out / "tables.md", markdown(lines).encode())
     except MpmoptError as error:
         print(f"{type(error).__name__}: {error}", file=sys.stderr)
         return 1

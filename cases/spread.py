@@ -24,11 +24,10 @@ from robots import worst
 
 from mpmopt.app.case import Case
 from mpmopt.app.multistart import multistart
-from mpmopt.app.sweeps import as_csv
 from mpmopt.assess.robustness import Robot, can_be_studied
 from mpmopt.assess.trajectory import Motion
 from mpmopt.io.console import reported
-from mpmopt.io.files import replace_file
+from mpmopt.io.files import as_csv, replace_file
 from mpmopt.results import runfile
 from mpmopt.validation import digits
 from mpmopt.view.draw import Squares, draw_walls, new_figure, own_style, png, set_view, view

@@ -33,9 +33,9 @@ from stability import (
 )
 from stability.common import Found
 
-from mpmopt.app.sweeps import as_csv, connected, results, sweep
+from mpmopt.app.sweeps import connected, results, sweep
 from mpmopt.errors import MpmoptError
-from mpmopt.io.files import replace_file
+from mpmopt.io.files import as_csv, replace_file
 
 MODULES = {
     "time_step": time_step, "weak": weak, "adversary": adversary, "actuation": actuation,

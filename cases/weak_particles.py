@@ -8,8 +8,6 @@ evaluations that fail, and measures by how much the void moves a binary design. 
 """
 
 import argparse
-import csv
-import io
 import sys
 import time
 from collections.abc import Iterator
@@ -30,9 +28,9 @@ from mpmopt.design.problem import Problem
 from mpmopt.design.variables import START, Variables
 from mpmopt.design.variation import refined
 from mpmopt.errors import MpmoptError, SimulationError
+from mpmopt.io.files import as_csv, replace_file
 from mpmopt.optimisation.loop import Optimisation, optimise
 from mpmopt.optimisation.settings import Settings, Stage
-from mpmopt.results import runfile
 from mpmopt.scene import Scene
 from mpmopt.scene.particles import discretise
 from mpmopt.simulation.simulation import Simulation
@@ -119,9 +117,7 @@ def distance_with_void(
         return distance(scene, keep, variables)
     scene = void.of(scene)
     particles = discretise(scene)
-    gamma = np.ones(particles.designed.size)
-    gamma[particles.designed] = keep
-    material = interpolate(scene.material, gamma)
+    material = interpolate(scene.material, particles.completed(keep.astype(float)))
     driven = signal(scene, variables.a, variables.theta, variables.b)
     simulation = Simulation(scene, particles, *material, driven)
     return float(Objective.of(scene, particles).centroid(simulation.run()))
@@ -208,18 +204,15 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--iterations", type=int, default=10, help="evaluations per beta (10)")
     arguments = parser.parse_args(argv)
     cells = 64 if arguments.quick else 128
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(Row._fields)
     try:
         arguments.out.mkdir(parents=True, exist_ok=True)
-        for name in CASES:
-            writer.writerows(rows_of(name, cells, arguments.iterations))
-        runfile.replace_file(arguments.out / "weak_particles.csv", text.getvalue().encode())
+        rows = [row for name in CASES for row in rows_of(name, cells, arguments.iterations)]
+        text = as_csv([row._asdict() for row in rows])
+        replace_file(arguments.out / "weak_particles.csv", text.encode())
     except MpmoptError as error:
         print(f"{type(error).__name__}: {error}", file=sys.stderr)
         return 1
-    lines = text.getvalue().replace("_", " ").splitlines()
+    lines = text.replace("_", " ").splitlines()
     table = [f".. csv-table:: Void at Courant number 0.56, {cells} x {cells} cells",
              "   :header-rows: 1", "", *(f"   {line}" for line in lines)]  # fmt: skip
     (arguments.out / "weak_particles.rst").write_text("\n".join(table) + "\n")

@@ -24,6 +24,7 @@ from __future__ import annotations
 import argparse
 import logging
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
@@ -61,7 +62,17 @@ def _read(path: Path) -> RunFile:
     return runfile.read_run(path)
 
 
-def plot(path: Path, out: Path | None, force: bool) -> int:
+def _target(out: Path | None, default: Path, force: bool) -> Path:
+    """The file to write, in a folder that is there; what `out` names is replaced only by force."""
+    from mpmopt.io.files import make_folder, refuse_existing
+
+    refuse_existing([out] if out else (), force)
+    target = out or default
+    make_folder(target.parent)
+    return target
+
+
+def plot(path: Path, out: Path | None, force: bool) -> None:
     """Write pictures of a run: its scene, its bodies in motion, its history."""
     from mpmopt.io.files import make_folder, refuse_existing
     from mpmopt.io.progress import Progress
@@ -79,21 +90,16 @@ def plot(path: Path, out: Path | None, force: bool) -> int:
             progress.print(str(picture))
 
         plot_run(folder, run, written)
-    return 0
 
 
-def report(path: Path, out: Path | None, force: bool) -> int:
+def report(path: Path, out: Path | None, force: bool) -> None:
     """Write a run's report: one HTML file with film, gait, history, designs and numbers."""
-    from mpmopt.io.files import make_folder, refuse_existing
     from mpmopt.view.report import report as reported_on
 
     found = _read(path)
-    target = out or path.parent / "report.html"
-    refuse_existing([target] if out else (), force)
-    make_folder(target.parent)
+    target = _target(out, path.parent / "report.html", force)
     reported_on(target, found.run, found.summary, found.versions, path)
     print(f"{target}: {target.stat().st_size / 1e6:.2g} MB")
-    return 0
 
 
 def film(
@@ -104,20 +110,16 @@ def film(
     forces: bool,
     finished: bool,
     force: bool,
-) -> int:
+) -> None:
     """Write a film of a run's design beside others, or of its finished robot."""
-    from mpmopt.io.files import make_folder, refuse_existing
     from mpmopt.view.film import film as filmed
 
     if mp4 and out is not None and out.suffix.lower() != ".mp4":
         raise DesignError(f"--mp4 does not write {out}: leave --mp4 out, or let FILE end in .mp4")
     run = _read(path).run
     name = "finished" if finished else "film"
-    target = out or path.parent / f"{name}.{'mp4' if mp4 else 'gif'}"
-    refuse_existing([target] if out else (), force)
-    make_folder(target.parent)
+    target = _target(out, path.parent / f"{name}.{'mp4' if mp4 else 'gif'}", force)
     print(f"{target}: {filmed(target, run, seconds, forces, finished)}")
-    return 0
 
 
 def verify(path: Path) -> int:
@@ -139,7 +141,7 @@ def verify(path: Path) -> int:
     return 1 if failed else 0
 
 
-def postprocess(path: Path, threshold: float) -> int:
+def postprocess(path: Path, threshold: float) -> None:
     """Print what a run's best design does once it is solid or absent everywhere."""
     import numpy as np
 
@@ -174,23 +176,18 @@ def postprocess(path: Path, threshold: float) -> int:
     print(f"design particles kept    {keep.sum()} of {keep.size}")
     loose = ", ".join(str(size) for size in sorted(sizes[1:], reverse=True)) or "none"
     print(f"pieces hanging on nothing, particles of each: {loose}")
-    return 0
 
 
-def scenes(path: Path, out: Path | None, seconds: float, force: bool) -> int:
+def scenes(path: Path, out: Path | None, seconds: float, force: bool) -> None:
     """Write a film of a run's finished robot in all scenes of its task, side by side."""
-    from mpmopt.io.files import make_folder, refuse_existing
     from mpmopt.view.ensemble import film_scenes
 
     run = _read(path).run
-    target = out or path.parent / "scenes.gif"
-    refuse_existing([target] if out else (), force)
-    make_folder(target.parent)
+    target = _target(out, path.parent / "scenes.gif", force)
     print(f"{target}: {film_scenes(target, run, seconds)}")
-    return 0
 
 
-def study(path: Path) -> int:
+def study(path: Path) -> None:
     """Print whether a run's best design keeps its gain and goes elsewhere; keep it in the run."""
     import numpy as np
 
@@ -225,17 +222,15 @@ def study(path: Path) -> int:
         refined(run.problem(), run.result.x, progress=show)
     if can_be_studied(run.scene):
         print(full_study(path))
-    return 0
 
 
-def forces(path: Path, out: Path | None, force: bool) -> int:
+def forces(path: Path, out: Path | None, force: bool) -> None:
     """Print, write and draw what drives and bears a run's best design, without grey."""
     import numpy as np
 
-    from mpmopt.app.sweeps import as_csv
     from mpmopt.assess.forces import books
     from mpmopt.assess.trajectory import post_processed
-    from mpmopt.io.files import make_folder, refuse_existing, replace_file
+    from mpmopt.io.files import as_csv, make_folder, refuse_existing, replace_file
     from mpmopt.io.progress import Progress
     from mpmopt.validation import digits
     from mpmopt.view.plot import plot_forces, plot_motion
@@ -266,26 +261,22 @@ def forces(path: Path, out: Path | None, force: bool) -> int:
         peak = digits(float(sizes[:, k].max()))
         print(f"{'force of ' + name:<24} mean ({mean}), at most {peak} over 1 % of the time")
     print(*files, sep="\n")
-    return 0
 
 
-def trajectory(path: Path, out: Path | None, force: bool) -> int:
+def trajectory(path: Path, out: Path | None, force: bool) -> None:
     """Write how a run's best design moves, without grey, as comma-separated values."""
     from mpmopt.assess.trajectory import post_processed
-    from mpmopt.io.files import make_folder, refuse_existing, replace_file
+    from mpmopt.io.files import replace_file
     from mpmopt.results.trajectory import table
 
     run = _read(path).run
-    target = out or path.parent / "trajectory.csv"
-    refuse_existing([target] if out else (), force)
+    target = _target(out, path.parent / "trajectory.csv", force)
     text = table(post_processed(run.problem(), run.result.x))
-    make_folder(target.parent)
     replace_file(target, text.encode())
     print(f"{target}: {len(text.splitlines()) - 1} instants")
-    return 0
 
 
-def cheapest(path: Path, tol: float, gradient_tol: float | None, seconds: float) -> int:
+def cheapest(path: Path, tol: float, gradient_tol: float | None, seconds: float) -> None:
     """Print the cheapest discretisation that tells a run's best design as well as the finest."""
     from mpmopt.assess import discretisation
     from mpmopt.io.progress import Progress
@@ -322,17 +313,15 @@ def cheapest(path: Path, tol: float, gradient_tol: float | None, seconds: float)
     print(f"{label:<24} {found.best}")
     if found.doubt:
         print(found.doubt)
-    return 0
 
 
-def resume(path: Path) -> int:
+def resume(path: Path) -> None:
     """Go on with a run that was stopped, and print what it found."""
     from mpmopt.app.case import resume as resumed
     from mpmopt.app.ending import ending
 
     resumed(path)
     print(ending(path))
-    return 0
 
 
 def export(path: Path, out: Path | None, force: bool, **options: Any) -> int:
@@ -388,7 +377,10 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"mpmopt {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND", title="commands")
 
-    def add(name: str, text: str, description: str, *examples: str) -> argparse.ArgumentParser:
+    def add(
+        do: Callable[..., int | None], text: str, description: str, *examples: str
+    ) -> argparse.ArgumentParser:
+        name = do.__name__
         command = commands.add_parser(
             name,
             help=text,
@@ -396,6 +388,7 @@ def _parser() -> argparse.ArgumentParser:
             epilog="\n  ".join(["examples:", *(f"mpmopt {name} {line}" for line in examples)]),
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
+        command.set_defaults(do=do)
         command.add_argument("path", type=Path, metavar="RUN.h5", help="run file of a case")
         return command
 
@@ -406,15 +399,15 @@ def _parser() -> argparse.ArgumentParser:
         )
 
     command = add(
-        "resume",
+        resume,
         "go on with it after a stop",
         "Go on with an unfinished run to the end that it would have had without a stop.",
         "out/walker/run.h5",
     )
-    command.set_defaults(do=resume, advice=how_to_go_on)
+    command.set_defaults(advice=how_to_go_on)
 
     command = add(
-        "report",
+        report,
         "write a page of its film, gait, history, designs and numbers",
         "Write report.html, a single file that any browser opens without a network: the best\n"
         "design in motion, its gait, the history, the designs, its robustness, the constraints,\n"
@@ -423,10 +416,9 @@ def _parser() -> argparse.ArgumentParser:
         "out/walker/run.h5 --out walker.html",
     )
     add_place(command, "FILE", "HTML file (default: report.html there)")
-    command.set_defaults(do=report)
 
     command = add(
-        "plot",
+        plot,
         "draw its scene, its designs in motion and its history",
         "Write schematic.png, history.png and, in motion, design.png (as it was optimised),\n"
         "post_processed.png (without grey) and reference.png (the solid reference design); of a\n"
@@ -435,10 +427,9 @@ def _parser() -> argparse.ArgumentParser:
         "out/walker/run.h5 --out pictures",
     )
     add_place(command, "DIR", "folder (default: the run's)")
-    command.set_defaults(do=plot)
 
     command = add(
-        "film",
+        film,
         "film its design beside the reference",
         "Write a film of the best design, the same without grey, and the solid reference\n"
         "design with the same actuation, in slow motion, for as long as the scene lasts; or of\n"
@@ -461,19 +452,17 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument(
         "--seconds", type=float, help="that it plays (default: so that each period is seen)"
     )
-    command.set_defaults(do=film)
 
     command = add(
-        "verify",
+        verify,
         "check the gradients of its best design",
         "Put the gradient before three independent witnesses: dot products, the complex step, and\n"
         "the order of Taylor's remainder. Exits with 1 if any check fails.",
         "out/walker/run.h5",
     )
-    command.set_defaults(do=verify)
 
     command = add(
-        "postprocess",
+        postprocess,
         "remove the void of its best design",
         "Say how far the best design goes once its particles are solid or absent.",
         "out/walker/run.h5",
@@ -482,10 +471,9 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument(
         "--threshold", type=float, default=0.3, help="gamma from which a particle stays (0.3)"
     )
-    command.set_defaults(do=postprocess)
 
     command = add(
-        "scenes",
+        scenes,
         "film its finished robot in all scenes of its task",
         "Write a film of the best design, without void and what hangs on nothing, in all scenes\n"
         "of the run's task at once, from rest; on ground of several frictions if it has only one.",
@@ -494,10 +482,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     add_place(command, "FILE", "ends in .gif or .mp4 (default: scenes.gif there)")
     command.add_argument("--seconds", type=float, default=10.0, help="that it plays (10)")
-    command.set_defaults(do=scenes)
 
     command = add(
-        "study",
+        study,
         "try its best design elsewhere",
         "Say how much of its gain the best design, without void, keeps with half the step, twice\n"
         "the step where that is stable, cells half as wide, and in the other formulation:\n"
@@ -507,10 +494,9 @@ def _parser() -> argparse.ArgumentParser:
         "numbers go to the run file and summary.json, and robustness.png shows them.",
         "out/walker/run.h5",
     )
-    command.set_defaults(do=study)
 
     command = add(
-        "forces",
+        forces,
         "say what drives and bears its best design",
         "Keep the books of the best design, without void: the work of actuators, viscosity,\n"
         "ground, walls and numerics, the cost of transport (actuators' work over weight and\n"
@@ -520,10 +506,9 @@ def _parser() -> argparse.ArgumentParser:
         "out/walker/run.h5 --out pictures",
     )
     add_place(command, "DIR", "folder (default: the run's)")
-    command.set_defaults(do=forces)
 
     command = add(
-        "trajectory",
+        trajectory,
         "write how its best design moves as a table",
         "Write trajectory.csv, of the best design without void, in the scene's units: time, place\n"
         "and velocity of the centroid, travel, the actuators' signals, and for each foot its\n"
@@ -532,10 +517,9 @@ def _parser() -> argparse.ArgumentParser:
         "out/walker/run.h5 --out walker.csv",
     )
     add_place(command, "FILE", "CSV file (default: trajectory.csv there)")
-    command.set_defaults(do=trajectory)
 
     command = add(
-        "cheapest",
+        cheapest,
         "find the cheapest discretisation that is accurate enough",
         "Measure the best design in one discretisation after the other, from the cheapest on,\n"
         "until distance and gradient agree with the finest affordable one; in both formulations\n"
@@ -550,10 +534,9 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument(
         "--seconds", type=float, default=60.0, help="what the finest reference may take (60)"
     )
-    command.set_defaults(do=cheapest)
 
     command = add(
-        "export",
+        export,
         "write its design as drawing, solid and motion",
         "Write the best design without grey: design.svg, design.dxf, design.stl and design.3mf at\n"
         "a size in millimetres, motion.vtkhdf in the scene's units. All but SVG and the motion,\n"
@@ -594,7 +577,6 @@ def _parser() -> argparse.ArgumentParser:
         "--kerf", type=float, metavar="MM", help="warn of members and gaps thinner than a cut"
     )
     add_place(command, "DIR", "folder (default: the run's)")
-    command.set_defaults(do=export)
     return parser
 
 

@@ -83,18 +83,10 @@ def count(
     return int(value)
 
 
-def instance(
-    owner: str,
-    name: str,
-    value: Any,
-    kind: type,
-    hint: str = "",
-    *,
-    error: type[MpmoptError] = DesignError,
-) -> None:
+def instance(owner: str, name: str, value: Any, kind: type, hint: str = "") -> None:
     """An error that says what to write where a value is of another kind."""
     if not isinstance(value, kind):
-        raise error(
+        raise DesignError(
             f"{owner}: {name} = {shown(value)} must be an object of class {kind.__name__}"
             f"{hint and f'; {hint}'}"
         )

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import small_scene
+from exact import at_rest
 from walker import walker
 
 from mpmopt.design.objective import Objective
@@ -214,10 +215,8 @@ def test_windows_that_outgrow_the_store_are_recomputed():
     for every in ("all", 40):
         particles = discretise(scene)
         ones = np.ones(48)
-        state = np.zeros((12, 48))
-        state[0:2] = particles.position.T
+        state = at_rest(particles)
         state[2:4] = [[9.0], [14.0]] * (state[0:2] - state[0:2].mean(axis=1, keepdims=True))
-        state[[8, 11]] = 1.0
         simulation = Simulation(scene, particles, ones, 1e-10 * ones, np.zeros((40, 2)), state)
         with simulation.checkpoints(Checkpointing(every, store="memory")) as checkpoints:
             forward = simulation.forward(checkpoints)

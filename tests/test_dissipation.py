@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from exact import solid_simulation
+from exact import at_rest, solid_simulation
 
 from mpmopt.scene import Grid, Material, Scene, Solid
 from mpmopt.scene.particles import discretise
@@ -18,9 +18,8 @@ def two_discs(dt):
     everything = discretise(scene)
     low, high = (np.hypot(*(everything.position.T - 0.1 - c)) < 0.2 for c in (0.2, 0.8))
     discs = everything.subset(low | high)
-    state = np.zeros((12, len(discs.position)))
-    state[0:2], state[2:4] = discs.position.T, np.where(low[low | high], 0.1, -0.1)
-    state[[8, 11]] = 1.0
+    state = at_rest(discs)
+    state[2:4] = np.where(low[low | high], 0.1, -0.1)
     end = solid_simulation(scene, discs, state).run()
 
     def kinetic(state):

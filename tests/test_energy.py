@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from conftest import small_scene
-from exact import Bar
-from stability.common import at_rest, solid
+from exact import Bar, at_rest
+from stability.common import solid
 from stability.time_step import block_scene
 from walker import slanted_legs, walker
 

@@ -71,8 +71,7 @@ def holed():
 def mask(problem, x):
     """Which cells of the particles' lattice are solid, with a ring of empty ones around them."""
     body = discretise(problem.scene, whole=True)
-    there = np.ones(len(problem.particles.position), dtype=bool)
-    there[problem.particles.designed] = problem.gamma(x) >= 0.3
+    there = problem.particles.completed(problem.gamma(x) >= 0.3)
     there = there[mirror_images(problem.scene, problem.particles, body)]
     i, j = np.floor(body.position / (0.5 * problem.scene.grid.dx)).astype(int).T
     lattice = np.zeros((i.max() + 2, j.max() + 2), dtype=bool)
@@ -100,8 +99,7 @@ def shoelace(ring):
 
 def test_the_outline_passes_between_particles_that_stay_and_particles_that_go(holed):
     problem, x = holed
-    gamma = np.ones(len(problem.particles.position))
-    gamma[problem.particles.designed] = problem.gamma(x)
+    gamma = problem.particles.completed(problem.gamma(x))
     for threshold in (0.1, 0.3, 0.7):
         clear = np.abs(gamma - threshold) > 0.01  # not on the line, but for rounding
         assert clear.mean() >= 0.99
@@ -114,8 +112,7 @@ def test_the_outline_passes_between_particles_that_stay_and_particles_that_go(ho
 def test_the_outline_of_a_subpixel_design_parts_the_same_particles(threshold):
     problem = Problem(CASES["preview"].scene, 100.0, subpixel=True)
     x = problem.join(**CASES["preview"].start)
-    there = np.ones(len(problem.particles.position), dtype=bool)
-    there[problem.particles.designed] = kept(problem, x, threshold)
+    there = problem.particles.completed(kept(problem, x, threshold))
     assert 0.2 < there.mean() < 0.9
     points = problem.particles.position
     inside = np.any([polygon.contains(points) for polygon in outline(problem, x, threshold)], 0)
@@ -495,8 +492,7 @@ def test_drawing_motion_and_count_agree_on_what_is_loose(tmp_path, seed):
     assert distance.max() <= 1e-6
     there = np.zeros(len(position), dtype=bool)
     there[index] = True
-    gamma = np.ones(len(position))
-    gamma[problem.particles.designed] = problem.gamma(x)
+    gamma = problem.particles.completed(problem.gamma(x))
     assert done.loose == (gamma >= 0.3).sum() - len(moving) >= 100
     upper = np.max([polygon.rings[0].max(axis=0) for polygon in done.polygons], axis=0)
     shift = upper - (28 * C, 24 * C)  # the bar's corner

@@ -358,9 +358,8 @@ def walked(kind: Any, cells: int) -> float:
     )  # fmt: skip
     scene = dataclasses.replace(scene, steps=round(1.0 / scene.time_step))
     particles = discretise(scene)
-    there = ~particles.designed
-    there[particles.designed] = slanted_legs(particles.position[particles.designed])
-    particles = particles.subset(there)
+    there = slanted_legs(particles.position[particles.designed])
+    particles = particles.subset(particles.completed(there))
     t = scene.time_step * np.arange(scene.steps)
     signal = (np.sin(30.0 * t - 0.3 * np.pi) - 0.5)[:, None]
     simulation = kind(scene, particles, *material_of(particles), signal)

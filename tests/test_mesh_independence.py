@@ -10,7 +10,7 @@ from walker import slanted_legs
 
 from mpmopt.scene.particles import discretise
 
-LAYER, CLAMPED = CHOICES[:2]
+LAYER = CHOICES[0]
 
 
 def test_edges_of_64_cells_are_the_same_body_on_all():

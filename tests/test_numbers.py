@@ -11,7 +11,8 @@ from mpmopt import kernels
 from mpmopt.design.actuation import signal
 from mpmopt.design.objective import Objective
 from mpmopt.design.problem import Problem
-from mpmopt.errors import SimulationError
+from mpmopt.design.step_control import with_halvings
+from mpmopt.errors import SceneError, SimulationError
 from mpmopt.kernels import contact
 from mpmopt.scene import Wall
 from mpmopt.scene.particles import Particles, discretise
@@ -148,6 +149,19 @@ def test_what_is_over_a_limit_is_tried_again_unless_it_is_torn_or_left_alone(
     assert steps == [4e-3, 4e-3]
     looser = Problem(scene, limits=Indicators(2.0, 1.0, 1e-3, 2.0, 0.1))
     assert np.isfinite(looser.value(x))
+
+
+def test_a_step_that_the_scene_does_not_allow_hides_no_failure():
+    def simulated(there):
+        if there is scene:
+            raise SimulationError("it burst", 3, -1, (0.0, 0.0), "none")
+        raise SceneError("no such step")
+
+    scene = small_scene()
+    with pytest.raises(SimulationError, match="it burst"):
+        with_halvings(scene, simulated, 2)
+    with pytest.raises(SceneError, match="no such step"):
+        with_halvings(small_scene(), simulated, 2)
 
 
 def test_a_window_holds_the_mirror_images_of_its_nodes():

@@ -233,10 +233,6 @@ def test_a_truncated_run_file_is_refused(path, share):
 def test_what_is_no_run_file_is_refused(tmp_path):
     with pytest.raises(RunFileError, match="not there"):
         runfile.read_run(tmp_path / "run.h5")
-    text = tmp_path / "text.h5"
-    text.write_text("not HDF5")
-    with pytest.raises(RunFileError):
-        runfile.read_run(text)
     with h5py.File(tmp_path / "other.h5", "w") as file:
         file["x"] = 1.0
     with pytest.raises(RunFileError, match="no run file"):

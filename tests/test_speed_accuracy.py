@@ -30,7 +30,6 @@ from speed_accuracy import (
 )
 
 from mpmopt.assess.discretisation import Discretisation, Measured, density
-from mpmopt.design.problem import Problem
 from mpmopt.errors import SceneError, SweepError
 from mpmopt.scene.particles import discretise
 
@@ -97,19 +96,6 @@ def test_the_total_lagrangian_bar_converges_with_order_two_at_a_fixed_courant_nu
     assert np.all(errors[-1] <= 3e-3)
     with pytest.raises(SceneError, match="stability limit"):
         Bar(16, 0.8, formulation="total")
-
-
-@pytest.mark.parametrize("name", list(ROBOTS))
-def test_every_resolution_sees_the_same_robot(name):
-    scene, phi = ROBOTS[name]
-    mass = []
-    for n in (64, 128, 256):
-        problem = Problem(Discretisation.of(scene, n / 128, 0.2).scene(scene), BETA)
-        gamma = problem.gamma(design(phi)(problem))
-        volume = problem.particles.volume[problem.particles.designed]
-        mass.append(gamma @ volume / volume.sum())
-    assert 0.2 < mass[-1] < 0.8
-    assert max(mass) / min(mass) <= 1.03
 
 
 def test_the_time_at_equal_accuracy_is_of_points_that_are_not_right_by_chance():

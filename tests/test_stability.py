@@ -24,8 +24,8 @@ from stability import (
 )
 from stability.common import Found
 
-from mpmopt.app.sweeps import as_csv
 from mpmopt.errors import SceneError, SimulationError
+from mpmopt.io.files import as_csv
 from mpmopt.scene import Material
 from mpmopt.scene.particles import discretise
 

@@ -8,6 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from exact import at_rest
 from scipy.optimize import brentq
 from walker import slanted_legs
 
@@ -17,7 +18,7 @@ from mpmopt.design.problem import Variables
 from mpmopt.errors import SceneError, SimulationError
 from mpmopt.scene import Actuator, Grid, Material, Scene
 from mpmopt.scene.particles import discretise
-from stability.common import Found, Line, Measured, Points, at_rest, largest, solid, stretch
+from stability.common import Found, Line, Measured, Points, largest, solid, stretch
 from stability.safe import STRENGTH
 from stability.weak import courant_scene
 

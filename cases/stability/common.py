@@ -36,14 +36,6 @@ class Found:
     lines: list[Line] = field(default_factory=list)
 
 
-def at_rest(particles: Particles) -> Array:
-    """State (12, N) of particles that do not move and are not deformed."""
-    state = np.zeros((12, len(particles.position)))
-    state[0:2] = particles.position.T
-    state[[8, 11]] = 1.0
-    return state
-
-
 def solid(
     scene: Scene,
     particles: Particles | None = None,

@@ -4,11 +4,12 @@ import math
 from typing import Any, Literal
 
 import numpy as np
+from exact import at_rest
 
 from mpmopt.errors import SimulationError
 from mpmopt.scene import Grid, Ground, Material, Scene, Solid, Wall
 from mpmopt.scene.particles import discretise
-from stability.common import Array, Found, Line, Measured, Points, Rows, at_rest, solid
+from stability.common import Array, Found, Line, Measured, Points, Rows, solid
 
 DX = 1.0 / 32.0
 STEEP = 0.3  # tan(alpha) of the incline

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 from crawler import crawler
-from exact import Bar
+from exact import Bar, at_rest
 from walker import walker
 
 from mpmopt.design.problem import Problem
@@ -16,7 +16,7 @@ from mpmopt.scene import Actuator, Grid, Material, Scene, Solid, Wall
 from mpmopt.scene.particles import discretise
 from mpmopt.simulation.simulation import Precision, Simulation
 from stability.actuation import equilibrium_stretch
-from stability.common import Found, Line, Measured, Points, at_rest, solid
+from stability.common import Found, Line, Measured, Points, solid
 from stability.time_step import MOTIONS, block_scene, isolated
 from stability.weak import courant_scene
 

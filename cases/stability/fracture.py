@@ -3,13 +3,14 @@
 from typing import Any
 
 import numpy as np
+from exact import at_rest
 
 from mpmopt.errors import SimulationError
 from mpmopt.scene import Grid, Material, Scene, Solid
 from mpmopt.scene.particles import discretise
 from mpmopt.scene.scene import Formulation
 from mpmopt.simulation.lagrangian import LagrangianSimulation
-from stability.common import Array, Found, Line, Measured, Points, at_rest, solid, stretch
+from stability.common import Array, Found, Line, Measured, Points, solid, stretch
 
 STRETCHES = (1.0 + 1e-6, 1.25, 1.5, 1.75, 2.0, 2.25, 2.5, 3.0, 3.5, 4.0, 5.0, 6.0, 7.0, 8.0)
 SPEEDS = (0.5, 0.75, 1.0, 1.25, 1.5, 2.0)

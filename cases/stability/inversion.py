@@ -3,13 +3,14 @@
 from typing import Any
 
 import numpy as np
+from exact import at_rest
 
 from mpmopt.errors import SimulationError
 from mpmopt.scene import Grid, Material, Scene, Solid
 from mpmopt.scene.particles import discretise
 from mpmopt.scene.scene import Formulation
 from mpmopt.simulation.lagrangian import LagrangianSimulation
-from stability.common import Array, Found, Line, Measured, Points, at_rest, solid
+from stability.common import Array, Found, Line, Measured, Points, solid
 
 AMPLITUDES = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.7, 1.0)
 RING = Material(lame_lambda=1000 * 0.3 / (1.3 * 0.4), lame_mu=1000 / 2.6, density=1000.0)

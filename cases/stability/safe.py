@@ -52,8 +52,7 @@ def at_random(case: str, beta: float, seed: int, cells: int = 64) -> dict[str, A
             return row | {"error": str(error)}
         row[key] = float(Objective.of(problem.scene, simulation.particles).centroid(states[-1]))
         if key == "distance":
-            solid = np.ones(states.shape[2], dtype=bool)
-            solid[problem.particles.designed] = problem.gamma(x) >= 0.5
+            solid = problem.particles.completed(problem.gamma(x) >= 0.5)
             row["solid_stretch"] = stretch(states[:, :, solid])
         scene = scene.vary(time_step=scene.time_step / 2.0)
     return row

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import scipy.linalg
+from exact import at_rest
 
 from mpmopt import kernels
 from mpmopt.errors import SceneError, SimulationError
@@ -17,7 +18,6 @@ from stability.common import (
     Measured,
     Points,
     Rows,
-    at_rest,
     failure,
     largest,
     solid,

@@ -97,9 +97,7 @@ def with_void(scene: Scene, there: np.ndarray, variables: Variables) -> float:
         If the simulation fails.
     """
     particles = discretise(scene)
-    gamma = np.ones(len(particles.position))
-    gamma[particles.designed] = there
-    material = interpolate(scene.material, gamma)
+    material = interpolate(scene.material, particles.completed(there.astype(float)))
     simulation = simulation_of(scene, particles, *material, variables.signal(scene))
     return float(Objective.of(scene, particles).centroid(simulation.run()))
 

@@ -80,7 +80,7 @@ class Case(Checked):
         if not callable(self.baseline):
             raise DesignError(
                 f"Case: baseline = {shown(self.baseline)} must be a function of positions (D, 2), "
-                "such as binary.solid_reference"
+                "such as threshold.solid_reference"
             )
         start = completed("Case", self.start)
         if isinstance(start["phi"], (str, os.PathLike)):

@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 
 from mpmopt.app.case import RESULTS, Case, baseline_particles, draw_or_warn, run
-from mpmopt.app.sweeps import as_csv, connected, sweep
+from mpmopt.app.sweeps import connected, sweep
 from mpmopt.assess.threshold import Baseline
 from mpmopt.design.task import Task
 from mpmopt.errors import RunFileError, SweepError
-from mpmopt.io.files import locked, make_folder, refuse_existing, replace_file
+from mpmopt.io.files import as_csv, locked, make_folder, refuse_existing, replace_file
 from mpmopt.optimisation.loop import check_body_fits
 from mpmopt.optimisation.settings import Settings
 from mpmopt.optimisation.starts import disturbed

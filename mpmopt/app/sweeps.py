@@ -6,9 +6,7 @@ were under way.
 
 from __future__ import annotations
 
-import csv
 import functools
-import io
 import itertools
 import json
 import logging
@@ -125,17 +123,6 @@ def results(outcomes: Sequence[Outcome]) -> list[dict[str, Any]]:
             "again to try these again"
         )
     return [outcome.result for outcome in outcomes]
-
-
-def as_csv(rows: Sequence[Mapping[str, Any]], digits: int = 6) -> str:
-    """Rows of the same names as comma-separated values, numbers with so many digits."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(rows[0])
-    for row in rows:
-        cells = row.values()
-        writer.writerow(f"{v:.{digits}g}" if isinstance(v, float) else v for v in cells)
-    return text.getvalue()
 
 
 @contextmanager

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,14 +13,14 @@ from mpmopt.assess import threshold
 from mpmopt.assess.threshold import distance
 from mpmopt.design.ensemble import side_by_side
 from mpmopt.design.problem import Problem
+from mpmopt.design.step_control import with_halvings
 from mpmopt.design.variation import refined
-from mpmopt.errors import FractureError, OverlapError, SceneError, SimulationError
+from mpmopt.errors import SceneError, SimulationError
 from mpmopt.scene import Scene
 from mpmopt.scene.particles import discretise, nearest_designed
 from mpmopt.scene.scene import Formulation
 from mpmopt.validation import instance
 
-T = TypeVar("T")
 # How often the step is halved where a simulation with other cells, or in the other formulation,
 # fails: what was designed in one need not be stable in the other.
 HALVINGS = 2
@@ -60,32 +59,6 @@ class Variant:
     retained: float = np.nan
     failure: str = ""
     halved: int = 0
-
-
-def with_shorter_steps(
-    scene: Scene, simulated: Callable[[Scene], T], halvings: int
-) -> tuple[T, int]:
-    """What a simulation gives, and how often the scene's step was halved until it did.
-
-    No step mends a scene that is none, a body that tears, or parts of one that lie in each other:
-    `SceneError`, `FractureError` and `OverlapError` are not tried again.
-
-    Raises
-    ------
-    SceneError, SimulationError
-        As the first that was tried.
-    """
-    first: SceneError | SimulationError | None = None
-    for halved in range(halvings + 1):
-        try:
-            there = scene.vary(time_step=scene.time_step / 2**halved) if halved else scene
-            return simulated(there), halved
-        except (SceneError, SimulationError) as error:
-            first = first or error
-            if isinstance(error, (SceneError, FractureError, OverlapError)):
-                break
-    assert first is not None
-    raise first
 
 
 def least(problem: Problem, x: NDArray[np.float64]) -> float:
@@ -197,7 +170,7 @@ def study(
             there = make()
             # What is as designed, or has another step, has that one.
             most = HALVINGS if name in OTHERWISE else 0
-            (reference, design), halved = with_shorter_steps(there, simulated, most)
+            (reference, design), halved = with_halvings(there, simulated, most)
             gain = rows[0].distance - rows[0].reference if rows else design - reference
             retained = threshold.retained_share(scene, design - reference, gain)
             step = there.time_step / 2**halved

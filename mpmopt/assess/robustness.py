@@ -13,13 +13,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import label
 
 from mpmopt.assess import threshold
 from mpmopt.assess.refinement import (
     HALVINGS,
     other_formulation,
-    with_shorter_steps,
     with_twice_the_step,
 )
 from mpmopt.assess.threshold import SOLID_LIMITS, solid_body
@@ -27,7 +25,7 @@ from mpmopt.design.actuation import frequencies
 from mpmopt.design.ensemble import side_by_side
 from mpmopt.design.objective import Objective
 from mpmopt.design.problem import Problem
-from mpmopt.design.step_control import check_indicators
+from mpmopt.design.step_control import check_indicators, with_halvings
 from mpmopt.design.variables import Variables
 from mpmopt.design.variation import Variation
 from mpmopt.errors import SceneError, SimulationError
@@ -346,14 +344,8 @@ def components(scene: Scene, keep: NDArray[np.bool_]) -> int:
         Design particles that are there.
     """
     half, whole = discretise(scene), discretise(scene, whole=True)
-    there = ~half.designed
-    there[half.designed] = keep
-    there = there[mirror_images(scene, half, whole)]
-    index = np.floor(whole.position * scene.particles_per_cell / scene.grid.dx).astype(int)
-    i, j = (index - index.min(axis=0)).T
-    lattice = np.zeros((i.max() + 1, j.max() + 1), dtype=bool)
-    lattice[i, j] = there
-    return int(label(lattice)[1])
+    there = half.completed(keep)[mirror_images(scene, half, whole)]
+    return int(threshold.connected(scene, whole, there).max())
 
 
 def study(
@@ -514,7 +506,7 @@ def _speeds(
 
         try:
             scene = trial.scene()
-            value, halved = with_shorter_steps(scene, simulated, trial.halvings)
+            value, halved = with_halvings(scene, simulated, trial.halvings)
             speeds[name] = value
             if halved:
                 shorter[name] = scene.time_step / 2**halved

@@ -18,7 +18,7 @@ from mpmopt.design.variables import Variables
 from mpmopt.design.variation import Variation
 from mpmopt.errors import DesignError, SimulationError
 from mpmopt.scene import Scene
-from mpmopt.scene.particles import discretise, nearest_designed, of_solid
+from mpmopt.scene.particles import Particles, discretise, nearest_designed, of_solid
 from mpmopt.simulation.formulations import simulation_of
 from mpmopt.simulation.simulation import Simulation
 from mpmopt.validation import shown
@@ -61,10 +61,8 @@ def solid_body(scene: Scene, keep: NDArray[np.bool_], variables: Variables) -> S
     designed = int(particles.designed.sum())
     if np.shape(keep) != (designed,):
         raise DesignError(f"keep has shape {np.shape(keep)}, the design particles {(designed,)}")
-    there = np.ones(particles.designed.size, dtype=bool)
-    there[particles.designed] = keep
-    particles = particles.subset(there)
-    ones = np.ones(there.sum())
+    particles = particles.subset(particles.completed(np.asarray(keep, dtype=bool)))
+    ones = np.ones(len(particles.position))
     return simulation_of(
         scene,
         particles,
@@ -175,16 +173,24 @@ def pieces(scene: Scene, keep: NDArray[np.bool_]) -> NDArray[np.int64]:
         0: held; 1, 2, ...: pieces that hang on nothing; -1: not there.
     """
     particles = discretise(scene)
-    there = ~particles.designed
-    there[particles.designed] = keep
+    there = particles.completed(keep)
+    labels = connected(scene, particles, there)
+    held = np.isin(labels, labels[~particles.designed])
+    _, number = np.unique(np.where(held, 0, labels), return_inverse=True)  # solid regions are 0
+    return np.where(there, number, -1)[particles.designed]
+
+
+def connected(scene: Scene, particles: Particles, there: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Number (N,) of the piece that each particle belongs to, from 1 on; 0 of what is not there.
+
+    Particles (N,) that are there hold together over edges of their lattice and not over corners.
+    """
     index = np.floor(particles.position * scene.particles_per_cell / scene.grid.dx).astype(int)
     i, j = (index - index.min(axis=0)).T
     lattice = np.zeros((i.max() + 1, j.max() + 1), dtype=bool)
     lattice[i, j] = there
-    labels = label(lattice)[0][i, j]
-    held = np.isin(labels, labels[~particles.designed])
-    _, number = np.unique(np.where(held, 0, labels), return_inverse=True)  # solid regions are 0
-    return np.where(there, number, -1)[particles.designed]
+    numbers: NDArray[np.int64] = label(lattice)[0][i, j]
+    return numbers
 
 
 def solid_reference(positions: NDArray[np.float64]) -> NDArray[np.bool_]:

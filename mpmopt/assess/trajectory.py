@@ -67,8 +67,8 @@ class Body:
 
 def optimised(problem: Problem, x: NDArray[np.float64]) -> Body:
     """A design as it was optimised, with its void."""
-    gamma, design = np.ones(len(problem.particles.position)), problem.gamma(x)
-    gamma[problem.particles.designed] = design
+    design = problem.gamma(x)
+    gamma = problem.particles.completed(design)
     present = problem.present(problem.split(x).phi)
     simulation, objective = problem.simulation(x), problem.task.maximise
     return Body("optimised design", simulation, gamma[present], objective, design)
@@ -229,9 +229,14 @@ def moving(
         As the first body, if none can be simulated.
     """
     failures = []
+
+    def moved(make: Make, scene: Scene) -> tuple[Body, Motion]:
+        body = make(problem.at(scene.time_step), x)
+        return body, Motion.of(body, frames(body.simulation.scene))
+
     for make in makes:
         try:
-            found, _ = with_halvings(problem, partial(_moved, make, frames, x), problem.halvings)
+            found, _ = with_halvings(problem.scene, partial(moved, make), problem.halvings)
         except SimulationError as error:
             logger.warning("a body is left out: %s", error)
             failures.append(error)
@@ -239,13 +244,6 @@ def moving(
             yield found
     if len(failures) == len(makes):
         raise failures[0]
-
-
-def _moved(
-    make: Make, frames: Frames, x: NDArray[np.float64], problem: Problem
-) -> tuple[Body, Motion]:
-    body = make(problem, x)
-    return body, Motion.of(body, frames(body.simulation.scene))
 
 
 def equal_steps(scene: Scene, count: int, first: int = 0) -> NDArray[np.int64]:

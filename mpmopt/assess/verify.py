@@ -14,7 +14,7 @@ import copy
 import dataclasses
 import math
 from collections.abc import Callable, Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +27,7 @@ from mpmopt.design.problem import Problem
 from mpmopt.design.term import Outcome
 from mpmopt.errors import DesignError
 from mpmopt.kernels import Parts, parts
-from mpmopt.scene import Scene, Wall
+from mpmopt.scene import Scene
 from mpmopt.scene.particles import discretise, of_solid
 from mpmopt.simulation.simulation import Simulation
 from mpmopt.simulation.surroundings import parameters_of
@@ -121,11 +121,7 @@ def kernel_mismatches(scene: Scene, seed: int = 0) -> dict[str, float]:
             bench.grid_update_adjoint,
             "grid" + " normal_force" * bool(scene.ground),
         ),
-        "g2p": (
-            bench.g2p,
-            bench.g2p_adjoint,
-            "position velocity affine_velocity node_velocity",
-        ),
+        "g2p": (bench.g2p, bench.g2p_adjoint, "position velocity affine_velocity node_velocity"),
     }
     if scene.ground:
         tests["press"] = bench.press, bench.press_adjoint, "position stiffness"
@@ -377,39 +373,24 @@ class _Bench:
         stiffness = self._particles(data_bar.stiffness, 1)
         return {"position": self._parts(bar).position, "stiffness": stiffness}
 
-    def _grid(self, v: Arrays, dtype: type) -> NDArray:
+    def _before_update(self, v: Arrays, dtype: type) -> tuple[Any, ...]:
         grid = np.zeros((self.nodes, kernels.NODE_SIZE), dtype)
         grid[self.mass_grid > 0.0, :3] = v["grid"]
         if "normal_force" in v:
             grid[self.mass_grid > 0.0, 3] = v["normal_force"]
-        return grid
+        return grid, self.window, self.parameters, self.parameters.clamps[0]
 
     def grid_update(self, v: Arrays) -> Arrays:
         dtype = np.result_type(*v.values()).type
-        scratch, grid = self._scratch(dtype), self._grid(v, dtype)
+        scratch, given = self._scratch(dtype), self._before_update(v, dtype)
         for column in range(self.window[2]):
-            kernels.grid_update(
-                grid,
-                self.window,
-                self.parameters,
-                self.parameters.clamps[0],
-                scratch.velocity,
-                column,
-            )
+            kernels.grid_update(*given, scratch.velocity, column)
         return {"velocity": scratch.velocity}
 
     def grid_update_adjoint(self, v: Arrays, w: Arrays) -> Arrays:
-        scratch, grid = self._scratch(float), self._grid(v, float)
+        scratch, given = self._scratch(float), self._before_update(v, float)
         for column in range(self.window[2]):
-            kernels.grid_update_adjoint(
-                grid,
-                self.window,
-                self.parameters,
-                self.parameters.clamps[0],
-                w["velocity"],
-                scratch.node_bar,
-                column,
-            )
+            kernels.grid_update_adjoint(*given, w["velocity"], scratch.node_bar, column)
         node_bar = scratch.node_bar[self.mass_grid > 0.0]
         result = {"grid": node_bar[:, :3], "normal_force": node_bar[:, 3]}
         return {name: result[name] for name in v}
@@ -613,12 +594,11 @@ def taylor_test(
 
 def contact_free(scene: Scene, steps: int = 200) -> Scene:
     """The first steps of a scene without walls, ground and gravity: nothing is ever touched."""
-    no_walls: tuple[Wall, ...] = ()
     steps = min(steps, scene.steps)
     return dataclasses.replace(
         scene,
         steps=steps,
-        walls=no_walls,
+        walls=(),
         ground=(),
         gravity=(0.0, 0.0),
         transient=min(scene.transient, 0.5 * steps * scene.time_step),

@@ -209,10 +209,9 @@ class Problem:
 
     def present(self, phi: NDArray) -> NDArray[np.bool_]:
         """Which of all particles are simulated (N,)."""
-        present = np.ones(len(self.particles.position), dtype=bool)
-        if self.void_cutoff > 0.0:  # gamma may be below zero by rounding
-            present[self.particles.designed] = self.chain.field(phi).gamma.real >= self.void_cutoff
-        return present
+        if self.void_cutoff == 0.0:  # gamma may be below zero by rounding
+            return np.ones(len(self.particles.position), dtype=bool)
+        return self.particles.completed(self.chain.field(phi).gamma.real >= self.void_cutoff)
 
     def simulation(self, x: NDArray) -> Simulation:
         """The simulation of a design."""
@@ -287,7 +286,11 @@ class Problem:
         """In all scenes of the task, each in a time step that is short enough."""
 
         def accepted(problem: Problem) -> Evaluation:
-            evaluation, halved = with_halvings(problem, lambda p: evaluate(p, x), self.halvings)
+            def in_scene(scene: Scene) -> Evaluation:
+                same = scene is problem.scene
+                return evaluate(problem if same else problem.at(scene.time_step), x)
+
+            evaluation, halved = with_halvings(problem.scene, in_scene, self.halvings)
             return dataclasses.replace(evaluation, halved=halved)
 
         if not self.members:

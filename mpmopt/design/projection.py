@@ -95,7 +95,7 @@ def project_subpixel(
     F(s) rises from 0 to 1 between the distances s = -1 and 1 from the edge, in half widths;
     s = (phi - phi_0) / (R n), n^2 = |grad phi|^2 + R^2 |grad grad phi|^2, phi_0 the threshold.
     """
-    reach, _, F = _edge(phi, threshold, differences)
+    reach, _, F = edge(phi, threshold, differences)
     low, high = (
         project(each, beta, threshold) for each in (phi - reach * F, phi + reach * (1 - F))
     )
@@ -110,7 +110,7 @@ def project_subpixel_adjoint(
     differences: list[scipy.sparse.csr_array],
 ) -> NDArray:
     """phi_bar from gamma_bar."""
-    reach, s, F = _edge(phi, threshold, differences)
+    reach, s, F = edge(phi, threshold, differences)
     low, high = phi - reach * F, phi + reach * (1.0 - F)
     low_bar = project_adjoint(low, beta, (1.0 - F) * gamma_bar, threshold)
     high_bar = project_adjoint(high, beta, F * gamma_bar, threshold)
@@ -124,10 +124,10 @@ def project_subpixel_adjoint(
     return phi_bar
 
 
-def _edge(
+def edge(
     phi: NDArray, threshold: float, differences: list[scipy.sparse.csr_array]
 ) -> tuple[NDArray, NDArray, NDArray]:
-    """R n, s within [-1, 1], and F."""
+    """R n, half the width of an edge on the scale of phi, s within [-1, 1], and F."""
     squares = sum((difference @ phi) ** 2 for difference in differences)
     reach = REACH * np.sqrt(squares + LEAST_SLOPE**2)
     s = (phi - (2.0 * threshold - 1.0)) / reach
@@ -138,13 +138,6 @@ def _edge(
 def _rise(s: NDArray) -> NDArray:
     """F."""
     return 0.5 + 0.0625 * s * (15.0 - 10.0 * s**2 + 3.0 * s**4)
-
-
-def half_width(
-    phi: NDArray, threshold: float, differences: list[scipy.sparse.csr_array]
-) -> NDArray:
-    """R n of `project_subpixel`: half the width of an edge, on the scale of phi."""
-    return _edge(phi, threshold, differences)[0]
 
 
 def edge_at(gamma: float) -> float:

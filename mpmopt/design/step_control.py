@@ -5,14 +5,12 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
-from mpmopt.errors import FractureError, OverlapError, SimulationError
+from mpmopt.errors import FractureError, OverlapError, SceneError, SimulationError
+from mpmopt.scene import Scene
 from mpmopt.simulation.indicators import Indicators
 from mpmopt.simulation.simulation import Simulation
-
-if TYPE_CHECKING:
-    from mpmopt.design.problem import Problem
 
 logger = logging.getLogger(__name__)
 
@@ -26,27 +24,32 @@ LIMITS = Indicators(
 
 
 def with_halvings(
-    problem: Problem, evaluate: Callable[[Problem], Result], halvings: int
+    scene: Scene, simulated: Callable[[Scene], Result], halvings: int
 ) -> tuple[Result, int]:
-    """An evaluation of a problem, or of it in a step that is short enough, and how often halved.
+    """What is simulated in a scene, or in it in a step that is short enough, and how often halved.
 
     Raises
     ------
+    SceneError
+        If the scene is none.
     SimulationError
         If the last attempt fails; a `FractureError` or `OverlapError` at once, as no step mends it.
     """
+    failure: SimulationError | None = None
     halved = 0
     while True:
         try:
-            return evaluate(problem), halved
-        except (FractureError, OverlapError):
-            raise
-        except SimulationError as error:
-            if halved == halvings:
+            there = scene.vary(time_step=scene.time_step / 2**halved) if halved else scene
+            return simulated(there), halved
+        except SceneError:
+            if failure is None:
                 raise
-            logger.info("time step %g is halved: %s", problem.scene.time_step, error)
-        halved += 1
-        problem = problem.at(problem.scene.time_step / 2.0)
+            raise failure from None  # not that its scene allows no shorter step
+        except SimulationError as error:
+            if halved == halvings or isinstance(error, (FractureError, OverlapError)):
+                raise
+            logger.info("time step %g is halved: %s", there.time_step, error)
+            halved, failure = halved + 1, error
 
 
 def check_indicators(indicators: Indicators, simulation: Simulation, limits: Indicators) -> None:

@@ -1,15 +1,18 @@
-"""Files that are complete or absent, in folders that one process at a time works in."""
+"""Files that are complete or absent, in folders that one process at a time works in; tables."""
 
 from __future__ import annotations
 
+import csv
 import fcntl
+import io
 import logging
 import os
 import re
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 from uuid import uuid4
 
 from mpmopt.errors import StorageError
@@ -41,6 +44,17 @@ def replace_file(path: str | os.PathLike[str], content: bytes) -> None:
     finally:
         with suppress(OSError):
             new.unlink(missing_ok=True)
+
+
+def as_csv(rows: Sequence[Mapping[str, Any]], digits: int = 6) -> str:
+    """Rows of the same names as comma-separated values, numbers with so many digits."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(rows[0])
+    for row in rows:
+        cells = row.values()
+        writer.writerow(f"{v:.{digits}g}" if isinstance(v, float) else v for v in cells)
+    return text.getvalue()
 
 
 def refuse_existing(paths: Iterable[Path], force: bool = False) -> None:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from mpmopt.assess.threshold import THRESHOLD, kept
 from mpmopt.design.chain import filter_matrix
 from mpmopt.design.problem import Problem
-from mpmopt.design.projection import edge_at, half_width
+from mpmopt.design.projection import edge, edge_at
 from mpmopt.scene.particles import discretise, mirror_images
 
 # The filtered design is sampled at so many intervals per particle spacing.
@@ -106,7 +106,7 @@ def outline(
     wrong = np.zeros(len(solid), dtype=bool)
     if chain.subpixel:
         filtered = chain.filter @ phi
-        width = half_width(filtered, 0.5, chain.differences)
+        width, _, _ = edge(filtered, 0.5, chain.differences)
         edges = np.abs(filtered) < width
         level = edge_at(threshold) * float(np.mean(width[edges])) if edges.any() else 0.0
         wrong = solid != (filtered >= level)

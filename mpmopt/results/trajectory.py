@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import csv
-import io
-
 import numpy as np
 
 from mpmopt.assess.feet import feet
 from mpmopt.assess.trajectory import Body, Motion, equal_steps
+from mpmopt.io.files import as_csv
 
 INSTANTS = 401  # unless there are fewer steps
 
@@ -44,9 +42,4 @@ def table(body: Body) -> str:
     for foot in feet(motion):
         columns[f"{foot.name}, height"] = foot.height
         columns[f"{foot.name}, stands"] = foot.stands.astype(int)
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(columns)
-    for row in zip(*columns.values()):
-        writer.writerow(f"{value:.9g}" for value in row)
-    return text.getvalue()
+    return as_csv([dict(zip(columns, row)) for row in zip(*columns.values())], digits=9)

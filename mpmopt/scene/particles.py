@@ -53,6 +53,12 @@ class Particles:
             self.region[keep],
         )  # fmt: skip
 
+    def completed(self, values: NDArray) -> NDArray:
+        """Values (N,) of all particles: those of the design particles (D,), and 1 elsewhere."""
+        found = np.ones(len(self.position), values.dtype)
+        found[self.designed] = values
+        return found
+
 
 class Solids(NamedTuple):
     """What `Material` has of the same name, of the solid that each of N particles is made of."""

@@ -3,23 +3,17 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from mpmopt.assess.robustness import FEW_FRICTIONS, Robot, lasting, unit
 from mpmopt.assess.trajectory import Motion, equal_steps
-from mpmopt.design.problem import Problem
 from mpmopt.design.step_control import with_halvings
 from mpmopt.design.variation import Variation
 from mpmopt.errors import DesignError, SimulationError
-from mpmopt.io.files import replace_file
-from mpmopt.io.progress import Progress
 from mpmopt.optimisation.history import Optimisation
-from mpmopt.view.film import LAST, RATE, Filmed, Screen, encoded
+from mpmopt.scene import Scene
+from mpmopt.view.film import LAST, Filmed, Screen, count_frames, write
 from mpmopt.view.gait import body_of
 
 logger = logging.getLogger(__name__)
@@ -55,34 +49,22 @@ def film_scenes(path: Path, run: Optimisation, seconds: float = SECONDS) -> Film
         raise DesignError(
             "film: only robots on ground, with actuators, are filmed in several scenes"
         )
-    count = round(seconds * RATE) if 0.0 < seconds <= 600.0 else 0
-    if count < 2:
-        raise DesignError(f"film: seconds = {seconds!r} must be from {2 / RATE:g} to 600")
+    count = count_frames(path, seconds)
     scenes = run.task.scenes or tuple(Variation(friction=value) for value in FEW_FRICTIONS)
-    x, shown, motions = run.result.x, SHOWN * unit(problem.scene), []
+    robot, shown, motions = Robot.of(problem, run.result.x), SHOWN * unit(problem.scene), []
 
-    def motion(variation: Variation, problem: Problem) -> Motion:
-        scene = lasting(variation.scene(problem.scene), shown)
-        body = body_of(Robot.of(problem, x), scene, str(variation))
-        return Motion.of(body, equal_steps(scene, count))
+    def motion(variation: Variation, scene: Scene) -> Motion:
+        scene = lasting(variation.scene(scene), shown)
+        return Motion.of(body_of(robot, scene, str(variation)), equal_steps(scene, count))
 
     for variation in scenes:
         try:
-            seen, _ = with_halvings(problem, partial(motion, variation), problem.halvings)
+            seen, _ = with_halvings(problem.scene, partial(motion, variation), problem.halvings)
             motions.append(seen)
         except SimulationError as error:
             logger.warning("the film is without the scene of %s: %s", variation, error)
     if not motions:
         raise DesignError("film: the robot cannot be simulated in any of its scenes")
-    screen = Screen(motions, seconds / shown)
-    with Progress("frames", count) as progress:
-
-        def frames() -> Iterator[NDArray[np.uint8]]:
-            for number in range(count):
-                yield screen.frame(number)
-                progress.step()
-
-        content = encoded(path, frames())
-    replace_file(path, content)
-    per_period = count * Robot.of(problem, x).period(problem.scene) / shown
-    return Filmed(count, seconds + LAST, seconds / shown, per_period, len(content))
+    size = write(path, Screen(motions, seconds / shown))
+    per_period = count * robot.period(problem.scene) / shown
+    return Filmed(count, seconds + LAST, seconds / shown, per_period, size)

@@ -247,12 +247,6 @@ def film(
     StorageError
         If the file cannot be written.
     """
-    path = Path(path)
-    writers = {".gif": _gif, ".mp4": _mp4}
-    if path.suffix.lower() not in writers:
-        raise DesignError(f"{path} ends in {path.suffix!r}, a film in one of {sorted(writers)}")
-    if path.suffix.lower() == ".mp4":
-        _ffmpeg()
     problem, x = run.problem(), run.result.x
     scene, begin = problem.scene, 0.0
     if finished:
@@ -266,9 +260,8 @@ def film(
     duration = scene.duration - begin
     if seconds is None:
         seconds = playing_time(scene, duration)
-    count = round(seconds * RATE) if 0.0 < seconds <= 600.0 else 0
-    if count < 2:
-        raise DesignError(f"film: seconds = {seconds!r} must be from {2 / RATE:g} to 600")
+    path = Path(path)
+    count = count_frames(path, seconds)
 
     def frames_of(scene: Scene) -> NDArray[np.int64]:
         return equal_steps(scene, count, round(begin / scene.time_step))
@@ -280,15 +273,7 @@ def film(
     bodies, motions = map(list, zip(*moving(problem, x, makes, frames_of)))
     slow = seconds / duration
     screen = Screen(motions, slow, [books(body.simulation) for body in bodies] if forces else ())
-    with Progress("frames", screen.frames) as progress:
-
-        def frames() -> Iterator[NDArray[np.uint8]]:
-            for number in range(screen.frames):
-                yield screen.frame(number)
-                progress.step()
-
-        content = writers[path.suffix.lower()](frames())
-    replace_file(path, content)
+    size = write(path, screen)
     shown = periods(scene, duration)
     per_period = count / shown if shown else 0.0
     if 0.0 < per_period < LEAST:
@@ -300,7 +285,7 @@ def film(
     if can_be_studied(scene) and not finished:
         one = unit(problem.scene)
         spans += f"; the speed is that of {SETTLED * one:g} to {SEEN * one:g} (film --finished)"
-    return Filmed(count, seconds + LAST, slow, per_period, len(content), spans)
+    return Filmed(count, seconds + LAST, slow, per_period, size, spans)
 
 
 def palette() -> Image.Image:
@@ -379,17 +364,42 @@ def _mp4(frames: Iterator[NDArray[np.uint8]]) -> bytes:
     return content
 
 
-def encoded(path: Path, frames: Iterator[NDArray[np.uint8]]) -> bytes:
-    """Frames as the content of a film of the kind that a path's ending names.
+WRITERS = {".gif": _gif, ".mp4": _mp4}
+
+
+def count_frames(path: Path, seconds: float) -> int:
+    """Number of frames of a film that plays for so long.
 
     Raises
     ------
-    DesignError
-        If it names none.
-    MissingLibraryError, StorageError
+    DesignError, MissingLibraryError
         As `film`.
     """
-    writers = {".gif": _gif, ".mp4": _mp4}
-    if path.suffix.lower() not in writers:
-        raise DesignError(f"{path} ends in {path.suffix!r}, a film in one of {sorted(writers)}")
-    return writers[path.suffix.lower()](frames)
+    if path.suffix.lower() not in WRITERS:
+        raise DesignError(f"{path} ends in {path.suffix!r}, a film in one of {sorted(WRITERS)}")
+    if path.suffix.lower() == ".mp4":
+        _ffmpeg()
+    count = round(seconds * RATE) if 0.0 < seconds <= 600.0 else 0
+    if count < 2:
+        raise DesignError(f"film: seconds = {seconds!r} must be from {2 / RATE:g} to 600")
+    return count
+
+
+def write(path: Path, screen: Screen) -> int:
+    """Write a screen's frames as a film of the kind that the path's ending names; its bytes.
+
+    Raises
+    ------
+    StorageError
+        As `film`.
+    """
+    with Progress("frames", screen.frames) as progress:
+
+        def frames() -> Iterator[NDArray[np.uint8]]:
+            for number in range(screen.frames):
+                yield screen.frame(number)
+                progress.step()
+
+        content = WRITERS[path.suffix.lower()](frames())
+    replace_file(path, content)
+    return len(content)
