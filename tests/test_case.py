@@ -318,7 +318,8 @@ def test_the_walkers_settings_are_those_of_the_design():
         assert isinstance(bound.term, OnePiece)
         assert len(case.task.scenes) == 3
         assert case.scene.formulation == "total"
-        assert [stage.subpixel for stage in case.settings.stages] == [True]
+        assert all(stage.subpixel for stage in case.settings.stages)
+    assert [len(case.settings.stages) for case in (preview, default)] == [1, 3]
     assert default.scene.steps > preview.scene.steps
     assert not paper.scene.ground
     assert (paper.scene, paper.task) == (walker(128, 2e-4), Task())

@@ -268,15 +268,15 @@ def test_bodies_without_void_are_judged_in_the_step_of_their_evaluation(told, mo
 
     def judged(problem, x):
         asked.append(problem.scene.time_step)
-        return 0.1
+        return 0.1 if asked[-1] == 1e-3 else 9.0
 
     monkeypatch.setattr("mpmopt.optimisation.loop.post_processed", judged)
     monkeypatch.setattr("mpmopt.assess.refinement.least", judged)
     stage = dataclasses.replace(STAGE, solid=True, refined=True)
     settings = dataclasses.replace(COUNTED, stages=(stage,), most_iterations=1)
     run, _ = told([1.0], settings, halved=2)
-    assert asked == [1e-3, 1e-3]
-    assert run.result.time_step == 1e-3
+    assert asked[-2:] == [1e-3, 1e-3]
+    assert (run.result.time_step, run.result.post_processed) == (1e-3, 0.1)
 
 
 def test_a_design_that_no_refinement_saw_is_no_best_however_far_it_goes(told, monkeypatch):
