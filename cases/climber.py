@@ -58,8 +58,8 @@ def climber(cells: int, time_step: float, seconds: float) -> Scene:
 def three_pairs(positions: np.ndarray) -> np.ndarray:
     """A spine, two pairs of legs that lean down, and one further down that leans up.
 
-    The best of 4786 drawings in a body with narrower cores, widened with it. It merely creeps up,
-    and slips where friction is 0.3; what it climbs is the optimisation's.
+    The best of 4786 drawings in a body with narrower cores, widened with it. It merely creeps; what
+    the robot climbs is the optimisation's.
     """
     c = 1 / 64
     x, y = positions.T

@@ -1,5 +1,6 @@
 """Stages, stop rule, the best design, and evaluations that fail."""
 
+import copy
 import dataclasses
 import itertools
 from typing import Any
@@ -110,20 +111,63 @@ def test_a_stage_hands_its_farthest_design_to_the_next(scene, start, monkeypatch
     assert second.step == 0.0
 
 
-def test_a_disturbed_stage_begins_at_the_first_design_with_a_field_added(scene, start):
-    stages = tuple(dataclasses.replace(STAGES[1], disturbed=seed) for seed in (None, 3, 4))
-    task = dataclasses.replace(DEFAULT_TASK, variables=(Frozen("b"),))
-    candidates: list[Any] = []
-    settings = Settings(stages, most_iterations=3)
-    run = optimise(scene, settings, start, lambda run: candidates.append(run.last), task=task)
+ANEW = tuple(dataclasses.replace(STAGES[1], disturbed=seed) for seed in (None, 3, 4))
+
+
+def test_a_disturbed_stage_begins_at_the_start_with_a_field_added(scene, start):
+    settings = Settings(ANEW, most_iterations=3)
+    run, candidates = tried(scene, settings, start)
     problem = run.problem()
     where = problem.particles.position[problem.particles.designed]
-    begun = [item.x for item in candidates[::3]]
-    assert np.array_equal(begun[0], start)
-    for x, seed in zip(begun[1:3], (3, 4), strict=True):
-        field = np.clip(random_start(scene, seed)(where), -1.0, 1.0)
-        assert np.array_equal(x, np.concatenate([field, start[len(where) :]]))
+    assert np.array_equal(candidates[0].x, start)
+    for item, seed in zip(candidates[3::3], (3, 4), strict=True):
+        field = random_start(scene, seed)(where)
+        assert np.array_equal(item.x, np.concatenate([field, start[len(where) :]]))
     assert run.result.counted == max(item.counted for item in run.best.values())
+    with pytest.raises(DesignError, match="the first stage begins at the start"):
+        Settings(ANEW[1:])
+
+
+def test_a_disturbed_stage_leaves_what_is_frozen(scene, start):
+    task = dataclasses.replace(DEFAULT_TASK, variables=(Frozen("phi"), Frozen("b")))
+    run = optimise(scene, Settings(ANEW[:2], most_iterations=2), start, task=task)
+    begun = run.problem().split(start)
+    for item in run.best.values():
+        found = run.problem().split(item.x)
+        assert np.array_equal(found.phi, begun.phi) and np.array_equal(found.b, begun.b)
+        assert not np.array_equal(item.x, start)
+
+
+def test_a_run_that_was_stopped_at_a_disturbed_stage_goes_the_same_way(scene, start):
+    states: list[Optimisation] = []
+    settings = Settings(ANEW[:2], most_iterations=2)
+    run = optimise(scene, settings, start, lambda run: states.append(copy.deepcopy(run)))
+    for state in states[1:3]:  # before its first evaluation, and after it
+        again = go_on(state)
+        assert np.array_equal(again.result.x, run.result.x)
+        assert [item.objective for item in again.history] == [
+            item.objective for item in run.history
+        ]
+
+
+def test_what_fails_in_one_ascent_is_no_matter_to_the_next(scene, start, monkeypatch):
+    calls = fail_on(monkeypatch, {1, 2, 3})
+    run = optimise(scene, Settings(ANEW, most_iterations=2, most_failures=2), start)
+    assert not run.gave_up
+    steps = [step for step, _ in calls]
+    assert [item.stage for item in run.history] == [0, 0, 0, 1, 1, 1, 2, 2]
+    assert np.array_equal(calls[3][1], calls[4][1])  # the start of the second, in half the step
+    assert steps[4] == steps[3] / 2.0
+
+
+def test_what_runs_side_by_side_has_the_same_bits(scene, start, monkeypatch):
+    settings = Settings((dataclasses.replace(STAGES[1], refined=True),), most_iterations=3)
+    found = []
+    for count in (1, 2):
+        monkeypatch.setattr("mpmopt.design.ensemble.processors", lambda count=count: count)
+        _, items = tried(scene, settings, start)
+        found.append([(item.objective, item.post_processed, item.refined) for item in items])
+    assert found[0] == found[1]
 
 
 def test_the_moving_average_ends_a_stage(scene, start):

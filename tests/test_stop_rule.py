@@ -263,7 +263,11 @@ def test_the_result_is_of_the_sharpest_stage_or_counts_most_without_void(told, m
     assert run.best[1].post_processed == 0.6
 
 
-def test_bodies_without_void_are_judged_in_the_step_of_their_evaluation(told, monkeypatch):
+@pytest.mark.parametrize("processors", [1, 2])
+def test_bodies_without_void_are_judged_in_the_step_of_their_evaluation(
+    told, monkeypatch, processors
+):
+    monkeypatch.setattr("mpmopt.design.ensemble.processors", lambda: processors)
     asked = []
 
     def judged(problem, x):
@@ -275,7 +279,7 @@ def test_bodies_without_void_are_judged_in_the_step_of_their_evaluation(told, mo
     stage = dataclasses.replace(STAGE, solid=True, refined=True)
     settings = dataclasses.replace(COUNTED, stages=(stage,), most_iterations=1)
     run, _ = told([1.0], settings, halved=2)
-    assert asked[-2:] == [1e-3, 1e-3]
+    assert asked == [4e-3] * (processors - 1) + [1e-3, 1e-3]  # the first was begun beside it
     assert (run.result.time_step, run.result.post_processed) == (1e-3, 0.1)
 
 

@@ -203,7 +203,7 @@ def books(simulation: Simulation, progress: Callable[[], None] | None = None) ->
 
 
 def cost_of_transport(simulation: Simulation) -> float:
-    """That of a body's `books`, at a fifth of the time: of the steps only actuators are looked at.
+    """That of a body's `books`, in less time: of the steps only actuators are looked at.
 
     Raises
     ------

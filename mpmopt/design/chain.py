@@ -182,8 +182,8 @@ class DesignChain:
         gamma = np.ones(self.designed.size, dtype=np.result_type(phi, float))
         gamma[self.designed] = self._projected(filtered)
         material = interpolate(self.solids, gamma)
-        self._last = Field(self, phi, filtered, gamma[self.designed], *material)
-        return self._last
+        last = self._last = Field(self, phi, filtered, gamma[self.designed], *material)
+        return last  # which another thread may have replaced
 
     def _projected(self, filtered: NDArray) -> NDArray:
         """gamma of the design particles."""

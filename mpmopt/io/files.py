@@ -52,7 +52,7 @@ def as_csv(rows: Sequence[Mapping[str, Any]], digits: int = 6) -> str:
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(rows[0])
     for row in rows:
-        cells = row.values()
+        cells = (row[name] for name in rows[0])
         writer.writerow(f"{v:.{digits}g}" if isinstance(v, float) else v for v in cells)
     return text.getvalue()
 

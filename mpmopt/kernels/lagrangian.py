@@ -82,7 +82,7 @@ class Lattice(NamedTuple):
     active: NDArray[np.bool_]  # (V,) whether a record has actuated particles
     actuation_stress: NDArray[np.float64]  # (K, 3) second Piola-Kirchhoff S: xx, xy, yy
     mass: NDArray  # (M,) of the nodes, lumped
-    squared_influence: NDArray[np.float64]  # (M,) no particle has more v^2 than the most of it v^2
+    squared_influence: NDArray[np.float64]  # (M,) v_p^2 <= max_i of it times v_i^2
     held: NDArray[np.int64]  # (H,) nodes that clamps hold
     holder: NDArray[np.int64]  # (H,) which clamp each of them is in
     clamps: NDArray[np.float64]  # (steps, K, 6) as those of `kernels.arrays.Parameters`

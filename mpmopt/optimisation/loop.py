@@ -191,6 +191,8 @@ def go_on(
         run.x, run.reason, run.gave_up = ascent.to_end()
         run.stage_state = None
         logger.info("stage %d: %s", run.stage, run.reason)
+        if any(stage.disturbed is not None for stage in stages[run.stage + 1 : run.stage + 2]):
+            run.gave_up = False  # the next one begins anew
         run.stage += not run.gave_up
     reached = run.stage + run.gave_up
     run.stop_reason = f"Stage {reached} of {len(stages)} was the last: {run.reason}"
@@ -291,18 +293,21 @@ class _Ascent:
 
     def _first(self) -> NDArray[np.float64]:
         """The design that the stage begins with."""
-        run, seed, problem = self.run, self.stage.disturbed, self.problem
+        run, seed, problem, freedom = self.run, self.stage.disturbed, self.problem, self.freedom
         if seed is None:
             return run.x
-        start = problem.split(run.first.x if run.first else run.x)
-        phi = disturbed(start.phi, run.scene, seed)
-        return self.freedom.started(problem.join(**{**start._asdict(), "phi": phi}))
+        assert run.first is not None  # no first stage is disturbed
+        start = run.first.x
+        named = problem.split(start)
+        phi = disturbed(named.phi, run.scene, seed)
+        x = freedom.started(problem.join(**{**named._asdict(), "phi": phi}))
+        return freedom.whole(start, freedom.reduced(x))
 
     def _step(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """The design to evaluate after x."""
         mma = self.mma
         if self.failures and self.incumbent is None:
-            spare = self._best_before()
+            spare = self._best_before() if self.stage.disturbed is None else None
             if spare is not None and not np.array_equal(spare, x):
                 return spare
             scene = self.problem.scene
@@ -352,17 +357,12 @@ class _Ascent:
         problem, halved = self.problem, self.problem.halvings
         indicators = Indicators(*len(Indicators._fields) * (np.nan,))
         time_step = problem.scene.time_step / 2.0**halved
-
-        def without_void(time_step: float) -> float:
-            return self._without_void(post_processed, problem.at(time_step), x)
-
-        def solid_meanwhile() -> float:
-            """In the step that most evaluations have."""
-            return without_void(problem.scene.time_step) if self.stage.solid else np.nan
-
         gamma = problem.gamma(x)  # once, before two threads ask for it
         try:
-            evaluation, given = meanwhile(lambda: problem.evaluate(x), solid_meanwhile)
+            evaluation, given = meanwhile(
+                lambda: problem.evaluate(x),
+                lambda: self._solid(problem.scene.time_step, x),  # which most evaluations end with
+            )
             value, constraints = evaluation.value, evaluation.constraints
             scenes = evaluation.scenes
             gradients = evaluation.gradients
@@ -374,7 +374,7 @@ class _Ascent:
             logger.info("evaluation %d failed: %s", len(run.history), error)
         solid = refined = np.nan
         if self.stage.solid and not failure:
-            solid = without_void(time_step) if halved else given()
+            solid = self._solid(time_step, x) if halved else given()
             best = run.best.get(run.stage)
             least = (-best.violation, best.counted) if best else (-np.inf, -np.inf)
             hopeful = (-violation, solid) > least
@@ -443,6 +443,12 @@ class _Ascent:
         if self.stage.refined and np.isnan(item.refined):
             return False
         return _order(item) > _order(best)
+
+    def _solid(self, time_step: float, x: NDArray[np.float64]) -> float:
+        """L without void in a time step; not a number if the stage does not ask, or it failed."""
+        if not self.stage.solid:
+            return np.nan
+        return self._without_void(post_processed, self.problem.at(time_step), x)
 
     def _without_void(
         self,

@@ -68,8 +68,8 @@ class Stage(Checked):
         Whether edges of the design are at least as wide as a particle, however large beta is
         (`projection.project_subpixel`); with a large one, such as 100, the rest is black and white.
     disturbed : int, optional
-        Begin at the run's first design with the `starts.random_start` of this seed added to its
-        phi, instead of where the stage before ended.
+        Begin at the run's start with the `starts.random_start` of this seed added to its phi,
+        instead of where the stage before ended. Not for the first stage.
 
     Raises
     ------
@@ -169,7 +169,7 @@ class Settings(Checked):
     Raises
     ------
     DesignError
-        If there is no stage or a number makes no sense.
+        If there is no stage, the first is disturbed, or a number makes no sense.
     """
 
     stages: tuple[Stage, ...] = STAGES
@@ -187,6 +187,10 @@ class Settings(Checked):
         stages = tuple(given) if isinstance(given, Iterable) else (given,)
         if not stages or not all(isinstance(stage, Stage) for stage in stages):
             raise DesignError(f"Settings: stages = {shown(given)} must be Stages, at least one")
+        if stages[0].disturbed is not None:
+            raise DesignError(
+                "Settings: the first stage begins at the start, not at a disturbed one"
+            )
         object.__setattr__(self, "stages", stages)
         _take(self, flag, "adapt_move_limit sharpen_asymptotes best_first")
         _take(self, count, "window least_iterations most_iterations most_failures", least=1)

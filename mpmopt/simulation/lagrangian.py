@@ -186,7 +186,8 @@ class LagrangianSimulation(Simulation):
         """What of a node's speed counts (M,): no particle is faster than the most of all nodes has.
 
         A node at a corner, of which particles take next to nothing, has next to no mass either, and
-        trembles far faster than any of them.
+        trembles far faster than any of them. For any c_i > 0, v_p = sum_i w_pi v_i is at most
+        max_i(c_i v_i) times the largest sum_i w_pi / c_i of a particle.
         """
         weights = self._weights[0]
         counts = np.minimum(LIGHT * weights.max(axis=0).toarray().ravel(), 1.0)
