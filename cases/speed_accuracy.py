@@ -31,7 +31,6 @@ import sys
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, replace
-from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -340,7 +339,6 @@ def measure_robot(name: str, scene: Scene, n: int, courant: float, choice: Choic
     return replace(measured, gradient=in_patches(laid.scene(scene), measured.gradient))
 
 
-@cache
 def sources() -> str:
     """A digest of what numbers depend on: the package's files and those of the cases."""
     digest = hashlib.sha256()
