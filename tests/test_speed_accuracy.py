@@ -2,6 +2,8 @@
 
 import csv
 import math
+import subprocess
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
@@ -215,7 +217,7 @@ def test_sources_are_the_package_and_the_cases(tmp_path, monkeypatch):
         path.write_text("1\n")
     monkeypatch.setattr(speed_accuracy.mpmopt, "__file__", str(files[0]))
     monkeypatch.setattr(speed_accuracy, "__file__", str(files[2]))
-    digest = speed_accuracy.sources.__wrapped__
+    digest = speed_accuracy.sources
     found = [digest()]
     for path in files:
         path.write_text("2\n")
@@ -308,6 +310,18 @@ def test_all_points_can_be_laid_out_and_are_measured_once(quick):
     if not quick:
         assert speed_accuracy.PAPER in points
         assert speed_accuracy.RECOMMENDED in points
+
+
+@pytest.mark.process
+def test_the_script_has_its_points_measured_by_processes(tmp_path):
+    command = [sys.executable, speed_accuracy.__file__, "--quick", "--out", str(tmp_path)]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    try:
+        said = process.stderr.readline()
+    finally:
+        process.kill()
+        process.communicate()
+    assert " points, " in said and "Error" not in said
 
 
 @pytest.mark.process
