@@ -69,10 +69,8 @@ def asymptotes():
 
 @pytest.fixture
 def run():
-    stages = [
-        distinct(Stage, refined=True, solid=True),
-        distinct(Stage, refined=True, solid=True),
-    ]
+    first, second = (distinct(Stage, refined=True, solid=True) for _ in range(2))
+    stages = [dataclasses.replace(first, disturbed=None), second]  # the first must not be
     settings = distinct(Settings, stages=tuple(stages), least_iterations=3, most_iterations=5)
     state = distinct(
         StageState, mma=asymptotes(), incumbent=distinct(Candidate),

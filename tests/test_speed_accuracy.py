@@ -316,6 +316,7 @@ def test_all_points_can_be_laid_out_and_are_measured_once(quick):
 def test_the_script_has_its_points_measured_by_processes(tmp_path):
     command = [sys.executable, speed_accuracy.__file__, "--quick", "--out", str(tmp_path)]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    assert process.stderr
     try:
         said = process.stderr.readline()
     finally:
