@@ -394,9 +394,10 @@ class Bench:
         if scenes is None:
             bar = Bar(32, 0.4).simulation.scene
             scenes = [bar if name == "bar" else ROBOTS[name][0] for name, *_ in points]
+        program = sources()
         wanted = [
             {"name": name, "scene": scene.to_json(), "n": n, "courant": courant,
-             "choice": asdict(choice), "program": sources()}
+             "choice": asdict(choice), "program": program}
             for (name, n, courant, choice), scene in zip(points, scenes, strict=True)
         ]  # fmt: skip
         outcomes = sweep(measure_point, wanted, self.store, self.executor, workers=1)
